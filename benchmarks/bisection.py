@@ -15,7 +15,7 @@ import drjit as dr
 
 from harnack.backend.arrays import Backend
 from harnack.enclosures import Enclosure, Levels, SlopeRange
-from harnack.enclosures.literature import BandEnclosure
+from harnack.literature.formula_enclosures import BandEnclosure
 
 _DEPTH, _MOST = 48, 2000
 

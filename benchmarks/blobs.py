@@ -18,13 +18,13 @@ import drjit as dr
 import numpy as np
 
 import harnack as hk
-from harnack.arithmetic import clipped_power
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.record_table import RecordTable
 from harnack.enclosures import SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.fields.blobs.kernels import CompactKernel
 from harnack.fields.formula import Formula, FormulaOnRay
+from harnack.literature import clipped_power
 
 # Rounding of a blob's derivatives, in units of their largest absolute values.
 _ROUNDINGS = 64.0

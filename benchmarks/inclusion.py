@@ -12,7 +12,7 @@ import numpy as np
 import harnack as hk
 from harnack.backend import choose_backend, to_float, to_vector3
 from harnack.enclosures import Enclosure
-from harnack.enclosures.literature import AffineEnclosure, BottomUpLinearEnclosure
+from harnack.literature import AffineEnclosure, BottomUpLinearEnclosure
 
 from .bisection import bisect
 from .blobs import BlobFormula, Scene

@@ -22,6 +22,7 @@ from typing import Any
 
 import harnack
 from harnack.cli.arguments import parsers
+from harnack.fields.parameters import Parametrized
 from harnack.rendering.option_table import OPTIONS, Option, options_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,6 +137,8 @@ def find(name: str) -> Any:
 def members_of(kind: type) -> Iterator[tuple[str, Any]]:
     """The public methods and properties that a class itself defines and documents."""
     attributes: dict[str, Any] = dict(vars(kind))
+    if Parametrized in kind.__bases__:  # which has no entry of its own
+        attributes = {**vars(Parametrized), **attributes}
     for name, value in attributes.items():
         if name.startswith("_"):
             continue

@@ -10,6 +10,7 @@ from . import gallery as gallery
 from . import geometry as geometry
 from . import io as io
 from . import kernels as kernels
+from . import literature as literature
 from . import live as live
 from . import math as math
 from . import meshing as meshing
@@ -38,6 +39,7 @@ from .fields.solids.tube import Tube
 from .geometry import Ball, Box, HalfSpace
 from .live import Slider, page, read_scene, view, write_scene
 from .meshing import MeshingError, check_print, mesh, repair
+from .progress import Progress
 from .rendering import Camera, Isolines, animate, render
 from .tracer import Hits, RayStatus, Surface, TraceOptions, crossings, trace
 
@@ -60,6 +62,7 @@ __all__ = [
     "Isolines",
     "MeshingError",
     "PolygonMesh",
+    "Progress",
     "RayStatus",
     "Slider",
     "SolidAngle",

@@ -4,12 +4,7 @@ name."""
 from __future__ import annotations
 
 import difflib
-import itertools
 from collections.abc import Iterable
-
-# Names are similar from this similarity on (0 to 1); each letter of a common prefix adds a bonus.
-_MIN_SIMILARITY = 0.6
-_COMMON_PREFIX_BONUS = 0.02
 
 
 def is_one_of(name: object, names: Iterable[str]) -> bool:
@@ -22,15 +17,6 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
     most similar candidate; '' if no candidate is similar, or the name is not a string."""
     if not isinstance(misspelled, str):
         return ""
-    word = misspelled[:100].lower()
-    likeness = {name: _likeness(word, name.lower()) for name in candidates}
-    best = max(likeness, key=lambda name: likeness[name], default="")
-    return f'; did you mean "{best}"?' if likeness.get(best, 0.0) >= _MIN_SIMILARITY else ""
-
-
-def _likeness(a: str, b: str) -> float:
-    """Return the similarity of two strings: difflib's ratio (0 to 1), and a bonus for each letter
-    of their common prefix."""
-    alike = (x == y for x, y in zip(a, b, strict=False))
-    prefix = sum(itertools.takewhile(bool, alike))
-    return difflib.SequenceMatcher(None, a, b).ratio() + _COMMON_PREFIX_BONUS * prefix
+    name_of_lowercase = {name.lower(): name for name in candidates}
+    similar = difflib.get_close_matches(misspelled[:100].lower(), name_of_lowercase, n=1)
+    return f'; did you mean "{name_of_lowercase[similar[0]]}"?' if similar else ""

@@ -1,5 +1,5 @@
-"""The progress of long tasks, shown on stderr as a bar or as lines of text. A task reports its
-progress by fractions: numbers that add up to 1 when the task is finished."""
+"""The progress of long tasks, shown on stderr as a bar or as lines of text, or told to a function.
+A task tells by fractions how much of it is finished, or by texts what is being done."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from typing import Any, cast
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
-Advance = Callable[[float], None]
 # Seconds between lines of text. A task that is finished sooner writes none.
 _SECONDS_BETWEEN_LINES = 5.0
 # What was finished within these first seconds (stored results, for example) does not count in the
@@ -20,31 +20,51 @@ _SECONDS_BETWEEN_LINES = 5.0
 _INSTANT_SECONDS = 0.5
 
 
-def teller(progress: Callable[[str], None] | None) -> Callable[[str], None]:
-    """Return the function to which messages about progress are passed: `progress` itself, or one
-    that ignores them if `progress` is None.
+class Progress(str):
+    """A text that says what a long task is doing, such as "rendering: 25%" or "refining". It is
+    what a function that is given as `progress` is called with.
 
-    Raises:
-        TypeError: progress is neither a function nor None.
+    done: the fraction of the task that is finished; None if it is not known.
     """
-    if progress is None:
-        return lambda message: None
-    if not callable(progress) or isinstance(progress, type):
-        raise TypeError(
-            "progress must be a function that is told what is being done, such as print, not "
-            f"{progress!r:.60}"
-        )
-    return progress
+
+    done: float | None
+
+    def __new__(cls, text: str = "", done: float | None = None) -> Progress:
+        progress = super().__new__(cls, text)
+        progress.done = done
+        return progress
+
+
+ProgressFunction = Callable[[Progress], None]
+
+
+class ProgressReporter:
+    """By which a task tells its progress.
+
+    name: of the task, such as "rendering".
+    show: called with what is told.
+    """
+
+    def __init__(self, name: str, show: ProgressFunction) -> None:
+        self._name, self._show, self._done = name, show, 0.0
+
+    def advance(self, part: float) -> None:
+        """Tell that a fraction of the task was finished. All fractions add up to 1."""
+        self._done += part
+        self._show(Progress(f"{self._name}: {self._done:.0%}", self._done))
+
+    def tell(self, text: str) -> None:
+        """Tell what is being done now."""
+        self._show(Progress(text))
 
 
 @contextmanager
-def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
-    """Context manager that shows on stderr how much of the task `name` is finished. It yields a
-    function, which the task calls with each fraction that it has finished; all fractions add up to
-    1.
+def show_progress(name: str, progress: bool | ProgressFunction) -> Generator[ProgressReporter]:
+    """Context manager that shows on stderr how far the task `name` is. It yields the reporter, to
+    which the task tells its progress.
 
-    progress: whether to show the progress; or a function that receives the fractions instead. That
-        function may raise an exception to stop the task.
+    progress: whether to show the progress; or a function that is told it instead. That function may
+        raise an exception to stop the task.
 
     A terminal shows a bar. Notebooks and log files get lines of text, because a bar in a notebook
     would need ipywidgets, and log files would contain a terminal's control codes.
@@ -52,50 +72,59 @@ def progress_bar(name: str, progress: bool | Advance) -> Generator[Advance]:
     Raises:
         TypeError: progress is neither a bool nor a function.
     """
-    if not callable(progress) and not isinstance(cast("Any", progress), bool):
+    if isinstance(progress, type) or not (
+        callable(progress) or isinstance(cast("Any", progress), bool)
+    ):
         raise TypeError(f"progress must be True, False or a function, not {progress!r:.60}")
     console = Console(stderr=True)
     if callable(progress):
-        yield progress
+        yield ProgressReporter(name, progress)
     elif not progress:
-        yield lambda part: None
+        yield ProgressReporter(name, lambda progress: None)
     elif console.is_terminal and not console.is_jupyter:
-        columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task("", total=1.0)
-            yield lambda part: bar.advance(task, part)
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(),
+                   TaskProgressColumn(), TimeRemainingColumn())  # fmt: skip
+        with Bar(*columns, console=console, transient=True) as bar:
+            task = bar.add_task(name, total=1.0)
+
+            def show(told: Progress) -> None:
+                """Show the finished fraction, or the text beside a bar of unknown length."""
+                if told.done is None:
+                    bar.update(task, description=told, total=None)
+                else:
+                    bar.update(task, completed=told.done)
+
+            yield ProgressReporter(name, show)
     else:
-        yield _TextProgress(name)
+        yield ProgressReporter(name, _TextLines(name))
 
 
-class _TextProgress:
-    """Prints a line of text about the progress of a task every few seconds. It is called with each
-    fraction of the task that was finished.
+class _TextLines:
+    """Prints a line of text about the progress of a task every few seconds.
 
     name: the name of the task.
 
-    _done: the fraction that is finished so far.
     _cached_fraction: the fraction that was finished within the first half second, for example
         because stored results were found. It does not count in the estimate of the remaining time.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._done = 0.0
         self._cached_fraction = 0.0
         self._start = self._last = time.monotonic()
 
-    def __call__(self, part: float) -> None:
-        """Note that the fraction `part` was finished. Print a line if the last one is several
-        seconds old, unless the task is finished."""
-        self._done += part
-        now = time.monotonic()
-        if now - self._start < _INSTANT_SECONDS:  # parts that are there already
-            self._cached_fraction = self._done
-        if now - self._last < _SECONDS_BETWEEN_LINES or self._done >= 1 - 1e-9:
+    def __call__(self, progress: Progress) -> None:
+        """Print a line if the last one is several seconds old, unless the task is finished."""
+        done, now = progress.done, time.monotonic()
+        past = now - self._start
+        if done is not None and past < _INSTANT_SECONDS:  # parts that are there already
+            self._cached_fraction = done
+        is_finished = done is not None and done >= 1 - 1e-9
+        if now - self._last < _SECONDS_BETWEEN_LINES or is_finished:
             return
         self._last = now
-        past = now - self._start
-        left = past * (1 - self._done) / (self._done - self._cached_fraction or self._done)
-        text = f"{self._name}: {self._done:.0%} after {past:.0f} s, about {left:.0f} s left"
+        text = f"{self._name}: {progress}"
+        if done is not None:
+            left = past * (1 - done) / (done - self._cached_fraction or done)
+            text = f"{progress} after {past:.0f} s, about {left:.0f} s left"
         print(text, file=sys.stderr, flush=True)

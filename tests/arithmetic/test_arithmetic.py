@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -315,8 +316,8 @@ def places(rng: Any, count: int) -> tuple[Any, Any, Any]:
 @pytest.mark.few(1)
 @pytest.mark.parametrize("precision", QUICK_PRECISIONS)
 @pytest.mark.parametrize("name", FORMULAS)
-@pytest.mark.parametrize("anchored", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_jets_along_pieces(name: str, precision: Any, *, anchored: bool) -> None:
+@pytest.mark.parametrize("is_narrowed", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_jets_along_pieces(name: str, precision: Any, *, is_narrowed: bool) -> None:
     """Values lie in the range; difference quotients of first order in that of F', of second order
     in that of F''."""
     backend, rng = choose_backend(precision), np.random.default_rng(4)
@@ -326,9 +327,10 @@ def test_jets_along_pieces(name: str, precision: Any, *, anchored: bool) -> None
     start = start.astype(backend.dtype)
     end = start + length
     at, along = (backend.Array3f(*(backend.Float(c) for c in v.T)) for v in (p, d))
-    jet = formula(
-        *Jet.along_ray(at, along, backend.Float(start), backend.Float(end), anchored=anchored)
-    )
+    coordinates = Jet.along_ray(at, along, backend.Float(start), backend.Float(end))
+    if not is_narrowed:
+        coordinates = tuple(replace(one, jet_at_start=None) for one in coordinates)
+    jet = formula(*coordinates)
     p, d, start, width = (v.astype(Long) for v in (p, d, start, end - start))
 
     def f(s: Any) -> Any:

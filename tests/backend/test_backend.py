@@ -67,7 +67,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
     ],
 )
 def test_version_from_file_name(tmp_path: Path, name: str, major: int | None) -> None:
-    assert hb.library_version(touch(tmp_path / name)) == major
+    assert llvm.library_version(touch(tmp_path / name)) == major
 
 
 @pytest.mark.parametrize(
@@ -82,14 +82,14 @@ def test_version_from_file_name(tmp_path: Path, name: str, major: int | None) ->
 )
 def test_version_from_soname(tmp_path: Path, soname: bytes, major: int | None) -> None:
     path = touch(tmp_path / "libLLVM.so", ELF_WITH_SONAME % soname)
-    assert hb.library_version(path) == major
+    assert llvm.library_version(path) == major
 
 
 def test_version_from_where_links_end(tmp_path: Path) -> None:
     touch(tmp_path / "lib" / "libLLVM.so.19.1")
     link = tmp_path / "libLLVM.so"
     link.symlink_to(tmp_path / "lib" / "libLLVM.so.19.1")
-    assert hb.library_version(link) == 19
+    assert llvm.library_version(link) == 19
 
 
 @pytest.mark.parametrize(
@@ -97,11 +97,11 @@ def test_version_from_where_links_end(tmp_path: Path) -> None:
     [("Cellar/llvm/21.1.0/lib", 21), ("Cellar/llvm@19/19.1.7_1/lib", 19), ("llvm-18/lib", 18)],
 )
 def test_version_from_folder(tmp_path: Path, folder: str, major: int) -> None:
-    assert hb.library_version(touch(tmp_path / folder / "libLLVM.dylib")) == major
+    assert llvm.library_version(touch(tmp_path / folder / "libLLVM.dylib")) == major
 
 
 def test_version_of_a_library_that_is_not_there(tmp_path: Path) -> None:
-    assert hb.library_version(tmp_path / "libLLVM.so") is None
+    assert llvm.library_version(tmp_path / "libLLVM.so") is None
 
 
 @pytest.mark.parametrize(
@@ -123,14 +123,14 @@ def test_libraries_are_found_once_each_and_best_first(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "libLLVM.so").symlink_to(tmp_path / "a" / "libLLVM-19.so.1")
     (tmp_path / "b" / "libLLVM-21.so").symlink_to(tmp_path / "nowhere")
-    found = hb.find_libraries([tmp_path / "a", tmp_path / "b", tmp_path / "missing"])
+    found = llvm.find_libraries([tmp_path / "a", tmp_path / "b", tmp_path / "missing"])
     assert [library.major for library in found] == [19, 23, 18, 24, 15, 14]
 
 
 def test_earlier_folder_wins_among_equals(tmp_path: Path) -> None:
     for folder in ("near", "far"):
         touch(tmp_path / folder / "libLLVM.so.19.1")
-    found = hb.find_libraries([tmp_path / "near", tmp_path / "far"])
+    found = llvm.find_libraries([tmp_path / "near", tmp_path / "far"])
     assert found[0].path == tmp_path / "near" / "libLLVM.so.19.1"
 
 
@@ -151,7 +151,7 @@ def test_bad_library_in_the_environment_is_refused_not_suffered(tmp_path: Path) 
 
 
 def test_missing_library_in_the_environment_is_named(tmp_path: Path) -> None:
-    code = "import harnack.backend as hb; hb.ensure_llvm()"
+    code = "from harnack.backend import llvm; llvm.ensure_llvm()"
     done = run_python(code, DRJIT_LIBLLVM_PATH=str(tmp_path / "libLLVM.so"))
     assert done.returncode == 1
     assert "there is no such file" in done.stderr
@@ -159,10 +159,10 @@ def test_missing_library_in_the_environment_is_named(tmp_path: Path) -> None:
 
 def test_import_leaves_the_environment_alone_and_picks_an_acceptable_llvm() -> None:
     code = (
-        "import os, harnack.backend as hb\n"
+        "import os\nfrom harnack.backend import llvm\n"
         "assert 'DRJIT_LIBLLVM_PATH' not in os.environ\n"
-        "assert hb.loaded_library().major == hb.best_library().major == hb.ensure_llvm()\n"
-        "assert hb.loaded_library().rejection_reason is None\n"
+        "assert llvm.loaded_library().major == llvm.best_library().major == llvm.ensure_llvm()\n"
+        "assert llvm.loaded_library().rejection_reason is None\n"
     )
     done = run_python(code)
     assert done.returncode == 0, done.stderr
@@ -174,7 +174,7 @@ def test_import_of_harnack_loads_no_mitsuba_through_backend() -> None:
 
 
 def use_libraries(monkeypatch: pytest.MonkeyPatch, *majors: int) -> None:
-    found = tuple(hb.LLVMLibrary(Path(f"/lib/libLLVM-{m}.so.1"), m) for m in majors)
+    found = tuple(llvm.LLVMLibrary(Path(f"/lib/libLLVM-{m}.so.1"), m) for m in majors)
     monkeypatch.setattr(llvm, "find_libraries", lambda: found)
     monkeypatch.delenv(llvm.PATH_VARIABLE, raising=False)
 
@@ -185,7 +185,7 @@ def test_advice_points_at_an_acceptable_library_that_is_there(
     use_libraries(monkeypatch, 19, 15)
     monkeypatch.setattr(llvm, "_loaded_major", lambda: 15)
     with pytest.raises(hb.LLVMNotFoundError, match=r"aborts.*export DRJIT_LIBLLVM_PATH=\S+-19"):
-        hb.ensure_llvm()
+        llvm.ensure_llvm()
 
 
 def test_advice_is_to_install_if_nothing_acceptable_is_there(
@@ -194,7 +194,7 @@ def test_advice_is_to_install_if_nothing_acceptable_is_there(
     use_libraries(monkeypatch, 14)
     monkeypatch.setattr(llvm, "_loaded_major", lambda: None)
     with pytest.raises(hb.LLVMNotFoundError, match=r"Found only /lib/libLLVM-14.* Install LLVM 19"):
-        hb.ensure_llvm()
+        llvm.ensure_llvm()
 
 
 @pytest.mark.parametrize(

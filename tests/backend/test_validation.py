@@ -66,10 +66,10 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "seed": (lambda: hk.mesh(SPHERE, seed=None), "^seed must be an integer"),
     "simplify": (lambda: hk.mesh(SPHERE, simplify=ROW), "^simplify must be True or False"),
     "side": (lambda: hk.mesh(SPHERE, side=[]), '^side must be one of "surface", "below"'),
-    "progress": (lambda: hk.mesh(SPHERE, progress=True), "^progress must be a function"),
+    "progress": (lambda: hk.mesh(SPHERE, progress=None), "^progress must be True, False or a func"),
     "progress of a distance": (
         lambda: hk.distance.closest_points(SPHERE, [[2, 0, 0]], progress=1.0),
-        "^progress must be a func",
+        "^progress must be True, False or a func",
     ),
     "method": (lambda: hk.signed_distance(SPHERE, [[2, 0, 0]], method=ROW), "^unknown method"),
     "precision": (lambda: hk.trace(SPHERE, [[2, 0, 0]], [[1, 0, 0]], precision=ROW), "^precision"),

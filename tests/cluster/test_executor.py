@@ -135,10 +135,10 @@ def test_a_worker_that_is_killed_takes_nothing_with_it(tmp_path: Path) -> None:
     alone = hk.render(POLYGON, progress=False, **{**way, "chunks": None})
     kept: dict[str, Any] = {**way, "checkpoint": tmp_path}
     local = {"threads_per_worker": 1, "processes": True, "dashboard_address": None}
-    done: list[float] = []
+    done: list[hk.Progress] = []
 
-    def kill(part: float) -> None:
-        done.append(part)
+    def kill(progress: hk.Progress) -> None:
+        done.append(progress)
         if len(done) == 4:
             os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
         if len(done) == 10:
@@ -163,7 +163,7 @@ def test_a_job_is_opened_once_by_each_worker(client: Any) -> None:
     from harnack.cluster.serialization import _deserialize_cached
 
     client.run(_deserialize_cached.cache_clear)
-    found = list(Executor(client).run_tasks(Squares(), "square", [(k,) for k in range(40)]))
+    found = list(Executor(Squares(), client).run_tasks("square", [(k,) for k in range(40)]))
     assert [int(one["square"]) for one in found] == [k * k for k in range(40)]
     assert all(one.misses <= 1 for one in client.run(_deserialize_cached.cache_info).values())
 
@@ -172,7 +172,7 @@ def test_equal_parts_are_done_once(tmp_path: Path) -> None:
     folder = CheckpointFolder.open(tmp_path)
     for _ in range(2):
         found = list(
-            Executor(checkpoint=folder).run_tasks(Squares(), "square", [(k,) for k in (3, 2, 3, 3)])
+            Executor(Squares(), checkpoint=folder).run_tasks("square", [(k,) for k in (3, 2, 3, 3)])
         )
         assert [int(one["square"]) for one in found] == [9, 4, 9, 9]
     assert len(list(tmp_path.iterdir())) == 2
@@ -180,29 +180,26 @@ def test_equal_parts_are_done_once(tmp_path: Path) -> None:
 
 def test_errors_of_parts_come_back_and_the_rest_is_kept(client: Any, tmp_path: Path) -> None:
     parts = [(k,) for k in (1, 2, 3, -4, 5)]
+    executor = Executor(Squares(folder=tmp_path), client, CheckpointFolder.open(tmp_path))
     with pytest.raises(ValueError, match="-4 is negative"):
-        list(
-            Executor(client, CheckpointFolder.open(tmp_path)).run_tasks(
-                Squares(folder=tmp_path), "square", parts
-            )
-        )
+        list(executor.run_tasks("square", parts))
     assert len(list(tmp_path.iterdir())) >= 3
 
 
 def test_damaged_parts_are_refused_by_name(tmp_path: Path) -> None:
     folder = CheckpointFolder.open(tmp_path)
-    list(Executor(checkpoint=folder).run_tasks(Squares(), "square", [(3,)]))
+    list(Executor(Squares(), checkpoint=folder).run_tasks("square", [(3,)]))
     (path,) = tmp_path.iterdir()
     for damaged in (b"", path.read_bytes()[:40], b"no numbers"):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=f"{path.name} is damaged.*delete it"):
-            list(Executor(checkpoint=folder).run_tasks(Squares(), "square", [(3,)]))
+            list(Executor(Squares(), checkpoint=folder).run_tasks("square", [(3,)]))
 
 
 @pytest.mark.parametrize("chunks", [1, 3, 100])
 @pytest.mark.parametrize("count", [0, 1, 17])
 def test_runs_hold_everything_once(count: int, chunks: int) -> None:
-    runs = Executor(chunks=chunks).split_range(count, 6)
+    runs = Executor(Squares(), chunks=chunks).split_range(count, 6)
     assert [k for start, stop in runs for k in range(start, stop)] == list(range(count))
     assert all(0 < stop - start <= 6 for start, stop in runs)
 
@@ -271,13 +268,13 @@ def test_workers_that_cannot_work_are_refused_by_name(
         return own(*given, **settings) if answer is None else answer
 
     monkeypatch.setattr(client, "run", run)
-    with pytest.raises(RuntimeError, match=message), open_executor(client):
+    with pytest.raises(RuntimeError, match=message), open_executor(Squares(), client):
         pass
 
 
 def test_other_processors_are_told_of(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harnack.cluster.workers.rounding_fingerprint", lambda: "another")
-    with pytest.warns(UserWarning, match="round differently"), open_executor(client):
+    with pytest.warns(UserWarning, match="round differently"), open_executor(Squares(), client):
         pass
 
 
@@ -285,7 +282,7 @@ def test_workers_that_came_late_are_told_of(client: Any, monkeypatch: pytest.Mon
     monkeypatch.setattr("harnack.cluster.executor.worker_threads", lambda _: {})
     monkeypatch.setattr("harnack.cluster.executor.rounding_fingerprint", lambda: "another")
     with pytest.warns(UserWarning, match=r"processors of tcp://.* round differently"):
-        list(Executor(client).run_tasks(Squares(), "square", [(2,)]))
+        list(Executor(Squares(), client).run_tasks("square", [(2,)]))
 
 
 def test_a_lost_scheduler_is_told(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,4 +291,4 @@ def test_a_lost_scheduler_is_told(client: Any, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(client, "nthreads", lost)
     with pytest.raises(RuntimeError, match="the scheduler was lost"):
-        list(Executor(client).run_tasks(Squares(), "square", [(2,)]))
+        list(Executor(Squares(), client).run_tasks("square", [(2,)]))

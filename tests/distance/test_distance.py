@@ -110,8 +110,9 @@ class Helicoid(hk.Field):
         xx, xy = -2 * x * y / fourth, (x * x - y * y) / fourth
         return type(p)(xx, xy, 0), type(p)(xy, -xx, 0), type(p)(0.0)
 
-    def closest_boundary_point(self, p: Any) -> Any:
-        return type(p)(0.0, 0.0, p.z)
+    @property
+    def boundary(self) -> Any:
+        return hk.fields.Boundary(closest_point=lambda p: type(p)(0.0, 0.0, p.z))
 
 
 class Reversed(hk.Field):
@@ -138,25 +139,10 @@ class Bare(hk.Field):
         return hk.fields.Sample(dr.norm(p), p / dr.norm(p), (hk.proofs.Lipschitz(1.0),))
 
 
-class Step(hk.Field):
-    """0.3 z, and 1 more where x > 0: the sheet is the plane x = 0.
+class PlaneJumps(hk.fields.Jumps):
+    """The plane x = 0."""
 
-    Level 0.5 is z = 5/3 for x <= 0, z = -5/3 for x >= 0, and the strip of the sheet between.
-    """
-
-    has_jumps = True
-    default_level = 0.5
-    domain = hk.Box((-4, -4, -4), (4, 4, 4))
-
-    def __init__(self, side: Any = None) -> None:
-        self.side = side
-
-    def evaluate(self, p: Any) -> hk.fields.Sample:
-        side = dr.select(p.x > 0, 1.0, 0.0) if self.side is None else self.side
-        known = (hk.proofs.Lipschitz(0.3),)
-        return hk.fields.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
-
-    def next_jump(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> JumpCrossing:
+    def next_crossing(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> JumpCrossing:
         t = -o.x / d.x
         later = (t > after.t) | ((t == after.t) & (after.facet < 0))
         meets = active & later & (t <= t_max) & (d.x != 0)
@@ -174,8 +160,30 @@ class Step(hk.Field):
     def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Step:
         return Step(offset)
 
-    def distance_to_jumps(self, p: Any) -> Any:
+    def distance(self, p: Any) -> Any:
         return dr.abs(p.x)
+
+
+class Step(hk.Field):
+    """0.3 z, and 1 more where x > 0: the sheet is the plane x = 0.
+
+    Level 0.5 is z = 5/3 for x <= 0, z = -5/3 for x >= 0, and the strip of the sheet between.
+    """
+
+    default_level = 0.5
+    domain = hk.Box((-4, -4, -4), (4, 4, 4))
+
+    def __init__(self, side: Any = None) -> None:
+        self.side = side
+
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        side = dr.select(p.x > 0, 1.0, 0.0) if self.side is None else self.side
+        known = (hk.proofs.Lipschitz(0.3),)
+        return hk.fields.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
+
+    @property
+    def jumps(self) -> PlaneJumps:
+        return PlaneJumps()
 
     @staticmethod
     def distance(x: np.ndarray) -> np.ndarray:
@@ -485,7 +493,10 @@ def points_around(field: hk.Field, n: int, seed: int = 0) -> np.ndarray:
 
 def boundary_distance(field: hk.Field, x: np.ndarray) -> np.ndarray:
     """From points (n, 3) to the curve that the surface ends in; inf without one."""
-    nearest = field.closest_boundary_point(to_vector3(choose_backend("double"), x))
+    p, boundary = to_vector3(choose_backend("double"), x), field.boundary
+    nearest = None
+    if boundary is not None and boundary.closest_point is not None:
+        nearest = boundary.closest_point(p)
     if nearest is None:
         return np.full(len(x), np.inf)
     return np.linalg.norm(to_numpy(nearest) - x, axis=1)
@@ -820,10 +831,15 @@ def test_points_on_a_sheet() -> None:
 
 
 def test_a_field_must_say_how_far_its_sheets_are() -> None:
-    class Silent(Step):
-        distance_to_jumps = hk.Field.distance_to_jumps
+    class Quiet(PlaneJumps):
+        distance = hk.fields.Jumps.distance
 
-    with pytest.raises(NotImplementedError, match=r"Silent has jumps.*distance_to_jumps"):
+    class Silent(Step):
+        @property
+        def jumps(self) -> PlaneJumps:
+            return Quiet()
+
+    with pytest.raises(NotImplementedError, match=r"Silent has jumps.*distance\(p\) of its Quiet"):
         signed_distance(Silent(), [[1.0, 0.0, 0.0]], method="lower_bound")
 
 

@@ -346,7 +346,7 @@ def test_meshes_with_holes(
     search = closest_point_search.search
 
     def counted(surface: Any, *given: Any) -> Any:
-        searched.append(surface.field.has_jumps)
+        searched.append(surface.field.jumps is not None)
         return search(surface, *given)
 
     monkeypatch.setattr(closest_point_search, "search", counted)
@@ -533,12 +533,13 @@ def test_sheets_come_in_turn() -> None:
     """All of them, each once, by their distance."""
     vertices, faces = mesh_of_boxes(random_boxes(np.random.default_rng(5), 4))
     field, backend = hk.WindingNumber(vertices, faces), choose_backend("double")
-    prepared, x = field.prepare(backend), np.random.default_rng(6).uniform(-1, 1, (20, 3))
+    jumps, x = field.prepare(backend).jumps, np.random.default_rng(6).uniform(-1, 1, (20, 3))
+    assert jumps is not None
     p, always = to_vector3(backend, x), backend.Bool(True)
     after, seen = (backend.Float(-1), backend.UInt32(0xFFFFFFFF)), []
     distances = distances_to_triangles(x, vertices[faces[field.facet_faces]])
     for _ in range(distances.shape[1]):
-        near = prepared.nearest_facet(p, after, backend.Float(np.inf), always)
+        near = jumps.nearest_facet(p, after, backend.Float(np.inf), always)
         dr.eval(near.sort_key, near.facet, near.offset)
         after = (near.sort_key, near.facet)
         number = to_numpy(near.facet)
@@ -548,9 +549,9 @@ def test_sheets_come_in_turn() -> None:
     assert (np.sort(seen, axis=0) == np.arange(distances.shape[1])[:, None]).all()
     order = np.array([distances[np.arange(20), number] for number in seen])
     assert (np.diff(order, axis=0) > -1e-14).all()
-    none = prepared.nearest_facet(p, after, backend.Float(np.inf), always)
+    none = jumps.nearest_facet(p, after, backend.Float(np.inf), always)
     assert np.isinf(to_numpy(none.sort_key)).all()
-    short = prepared.nearest_facet(p, (backend.Float(-1), after[1]), backend.Float(1e-9), always)
+    short = jumps.nearest_facet(p, (backend.Float(-1), after[1]), backend.Float(1e-9), always)
     assert np.isinf(to_numpy(short.sort_key)).all()
 
 

@@ -424,4 +424,4 @@ def test_beside_a_point_of_a_cloud(precision: Any) -> None:
         assert (found.upper <= np.maximum(u, away) * (1 + 1e-6) + 1e-12).all()
         assert (found.lower <= found.upper).all()
     # A smoothed sum has no such points.
-    assert not len(hk.DipolePotential(points, points, smoothing=0.2).singular_points)
+    assert hk.DipolePotential(points, points, smoothing=0.2).boundary is None

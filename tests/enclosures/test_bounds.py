@@ -33,11 +33,11 @@ from harnack.enclosures.harmonic_ball import (
     SphericalCapEnclosure,
 )
 from harnack.enclosures.parabola import LipschitzEnclosure, ParabolaEnclosure, TaylorEnclosure
-from harnack.testing import BrokenPromiseError, check_enclosure, mutated_enclosure
+from harnack.testing import BrokenPromiseError, check_enclosure
 from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.testing.poisson import cap_mass, cap_movement, cap_slope, kernel_difference
-from harnack.testing.violation_search import original_enclosure
 from tests.oracles.exact import BOUNDS, exact_step, on_host
+from tests.oracles.mutated_enclosure import mutated_enclosure, original_enclosure
 
 # Solved to the end: the default number of rounds trades a little length for time.
 PATIENT = tuple(

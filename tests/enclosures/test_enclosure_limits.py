@@ -21,7 +21,7 @@ import pytest
 from drjit.llvm.ad import Float, Float64
 
 import harnack
-from harnack import enclosures
+from harnack import enclosures, literature
 from harnack.arithmetic import Interval
 from harnack.backend import choose_backend
 from harnack.backend.arrays import upload_floats
@@ -38,14 +38,13 @@ from harnack.enclosures.extremum import (
     ScaledEnclosure,
 )
 from harnack.enclosures.free_radius import HarmonicBallEnclosure
-from harnack.enclosures.literature import BandEnclosure, LongestOfEnclosure
 from harnack.enclosures.parabola import (
     ConvexityEnclosure,
     LipschitzEnclosure,
     ParabolaEnclosure,
     SphereArcEnclosure,
 )
-from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure, SinglePieceEnclosure
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.fields.blobs.blobs import DelayedEnclosure  # pyright: ignore[reportPrivateUsage]
 from harnack.fields.blobs.group_maximum import GroupMaximumEnclosure
 from harnack.fields.solids.extrusions import ExtrusionEnclosure
@@ -53,6 +52,9 @@ from harnack.fields.solids.from_field import FoldedEnclosure
 from harnack.fields.solids.outline_distance import SignedDistanceEnclosure
 from harnack.fields.solids.thread import OutsideCylinderEnclosure
 from harnack.fields.solids.tube import TangentEnclosure
+from harnack.literature import LongestOfEnclosure
+from harnack.literature.formula_enclosures import BandEnclosure
+from harnack.literature.taylor_forms import SinglePieceEnclosure
 
 SIZES = [0.0, 1e-12, 1e-4, 0.3, 1.0, 7.0, 1e5, 1e12, 1e25, np.inf]
 NUMBERS = SIZES + [-one for one in SIZES]
@@ -209,7 +211,7 @@ def kinds_of(package: ModuleType) -> set[type[Enclosure]]:
     return found - ASKS_OTHERS
 
 
-KINDS = sorted(kinds_of(enclosures), key=lambda kind: kind.__name__)
+KINDS = sorted(kinds_of(enclosures) | kinds_of(literature), key=lambda kind: kind.__name__)
 
 
 def test_every_enclosure_is_tried() -> None:

@@ -231,7 +231,7 @@ def test_lifts_stay_in_the_range_promised(name: str, precision: Any) -> None:
     direction = unit(rng.normal(size=(n, 3)))
     # Towards the nearest point of the curve, roughly, half of the time.
     p = to_vector3(choose_backend("double"), x)
-    toward = to_numpy(field.closest_boundary_point(p)) - x
+    toward = to_numpy(field.boundary.closest_point(p)) - x
     direction[::2] = unit(toward[::2] + 0.2 * np.linalg.norm(toward[::2], axis=1)[:, None]
                           * direction[::2])  # fmt: skip
     start = oracle(x).value
@@ -390,7 +390,7 @@ def test_closest_points_of_the_boundary() -> None:
     x = rng.normal(0, 1.5, (400, 3))
     x[0] = 0, 0, 1.0  # on the axis, all points of the circle are as near
     backend = choose_backend("double")
-    nearest = to_numpy(field.closest_boundary_point(to_vector3(backend, x)))
+    nearest = to_numpy(field.boundary.closest_point(to_vector3(backend, x)))
     d = MixedOracle(field.loops, field.circles)(x).smooth
     np.testing.assert_allclose(np.linalg.norm(nearest - x, axis=1), d, rtol=1e-9)
     on = MixedOracle(field.loops, field.circles)(nearest + 1e-12).smooth

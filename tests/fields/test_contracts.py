@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack import enclosures
+from harnack import enclosures, literature
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import (
     BoundedLaplacian,
@@ -33,13 +33,14 @@ from harnack.fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor,
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
-from harnack.testing import BrokenPromiseError, check_field, check_ray_samples, mutated_enclosure
+from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
 from harnack.testing.enclosure_contracts import PromiseCase
-from tests.arithmetic.test_arithmetics import PROOFS
 from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
 from tests.fields.test_shapes import SHAPES
+from tests.literature.test_enclosures_of_formulas import PROOFS
 from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.exact import BOUNDS
+from tests.oracles.mutated_enclosure import mutated_enclosure
 from tests.oracles.step_contracts import check_steps
 
 
@@ -267,12 +268,13 @@ def test_every_field_there_is_is_tested() -> None:
     assert {hk.fields.Lobes, hk.fields.HypersphericalHarmonic, hk.solids.Thread} <= exported
     proofs = {
         kind
-        for module in pkgutil.walk_packages(enclosures.__path__, "harnack.enclosures.")
+        for package in (enclosures, literature)
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
         for kind in vars(importlib.import_module(module.name)).values()
         if inspect.isclass(kind) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
     }
     # A bare parabola is made of no promise; `test_bounds` tries it by itself. Proofs from ranges
-    # along a path are tried in `test_arithmetics`, those of combinations in `test_combined_solids`.
+    # along a path are tried in `tests/literature`, those of combinations in `test_combined_solids`.
     promised = {
         kind for kind in proofs if kind.from_promise.__func__ is not Enclosure.from_promise.__func__
     }
@@ -322,17 +324,17 @@ def test_an_approximate_field_keeps_its_promises() -> None:
 def samples(field: Field, x: np.ndarray, fine: float = 1.0) -> tuple[Sample, Any]:
     """A sample in double precision and a function that makes its numbers arrays (n,) or (n, 3).
 
-    fine: the detail, as `Field.at_detail` takes it.
+    fine: the accuracy scale, as `VariableAccuracy.at` takes it.
     """
     backend = choose_backend("double")
     p, seen = to_vector3(backend, x), field.prepare(backend)
-    if field.has_jumps:
+    if seen.jumps is not None:
         up = backend.Array3f(0, 0, 1)
         nowhere = JumpCrossing(0.0, backend.UInt32(NO_FACET), backend.Float(0), up)
-        ahead = seen.initial_offset(p, up, backend.Float(0), backend.Bool(True))
-        seen = seen.continuation(p, up, nowhere, nowhere, ahead)
-    assert seen.has_variable_accuracy
-    sample = seen.at_accuracy(backend.Float(fine)).evaluate(p)
+        ahead = seen.jumps.initial_offset(p, up, backend.Float(0), backend.Bool(True))
+        seen = seen.jumps.continuation(p, up, nowhere, nowhere, ahead)
+    assert seen.variable_accuracy is not None
+    sample = seen.variable_accuracy.at(backend.Float(fine)).evaluate(p)
 
     def on_host(one: Any) -> np.ndarray:
         array = to_numpy(one) if dr.is_array_v(type(one)) else np.asarray(one)

@@ -112,7 +112,7 @@ def test_far_loops_are_polynomials(q: float) -> None:
         loop = unit(np.cumsum(rng.normal(size=(n, 3)), axis=0) + 4 * rng.normal(size=3))
         backend = choose_backend("double")
         curve = hk.SolidAngle(loop).prepare(backend)
-        nearest = curve.closest_boundary_point(backend.Array3f(0.0))
+        nearest = curve.boundary.closest_point(backend.Array3f(0.0))
         radius = q * float(to_numpy(dr.norm(nearest))[0])
         found = expanded(loop, [*range(n)], [*range(1, n), 0], radius)
         u = unit(rng.normal(size=(500, 3)))

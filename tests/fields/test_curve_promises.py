@@ -120,7 +120,7 @@ def test_taylor_s_remainder(name: str) -> None:
     field, rng = FIELDS[name], np.random.default_rng(1)
     loops = list(field.loops) or CURVES["square"]
     x = np.concatenate([places(loops, 250), rng.normal(size=(500, 3))])
-    nearest = to_numpy(field.closest_boundary_point(to_vector3(choose_backend("double"), x))) - x
+    nearest = to_numpy(field.boundary.closest_point(to_vector3(choose_backend("double"), x))) - x
     distance = np.linalg.norm(nearest, axis=1)
     x, nearest = x[distance > 1e-3], nearest[distance > 1e-3]
     d = rng.normal(size=x.shape)

@@ -14,12 +14,6 @@ from harnack.geometry import example_curves
 from harnack.geometry.convex_position import MAX_EXAMINED_VERTICES, segment_distance_lower_bound
 from harnack.geometry.curves import (
     CurveError,
-    CurveScaleError,
-    CurveShapeError,
-    NonFiniteVertexError,
-    RepeatedVertexError,
-    TooFewVerticesError,
-    TooManyVerticesError,
     bounding_box,
     edge_endpoints,
     is_convex_position,
@@ -71,38 +65,36 @@ def test_validated_loops_are_copies():
 
 
 @pytest.mark.parametrize(
-    ("loops", "error", "message"),
+    ("loops", "message"),
     [
-        ([], CurveShapeError, "there are no loops"),
-        (np.zeros((0, 3)), TooFewVerticesError, "0 different vertices"),
-        (TRIANGLE[:2], TooFewVerticesError, "2 different vertices"),
-        ([[1, 1, 1]] * 5, TooFewVerticesError, "1 different"),
-        (TRIANGLE[:2] * 3, TooFewVerticesError, "2 different"),
-        ([TRIANGLE, TRIANGLE[:2]], TooFewVerticesError, "loop 1 has 2"),
-        ([[0, 0], [1, 0], [0, 1]], CurveShapeError, r"not \(3, 2\); append a column of zeros"),
-        (np.zeros((3, 7)), CurveShapeError, r"not \(3, 7\); transpose it"),
-        ([0.0, 1.0, 2.0], CurveShapeError, r"must have shape \(n, 3\), not \(3,\)"),
-        (np.zeros((2, 2, 2, 3)), CurveShapeError, r"must have shape \(n, 3\)"),
-        ([[0, 0, 0], [1, 0], [0, 1, 0]], CurveShapeError, "every vertex needs three coord"),
-        ([TRIANGLE, [[0, 0, 0], [1, 0]]], CurveShapeError, "loop 1 is ragged"),
-        ([TRIANGLE, [[0, 0], [1, 0], [1, 1]]], CurveShapeError, "loop 1 must have shape"),
-        ("abc", CurveShapeError, "must hold real numbers"),
-        (None, CurveShapeError, "must hold real numbers"),
-        (np.array(TRIANGLE) * 1j, CurveShapeError, "must hold real numbers"),
-        ([[0, 0, 0], [1, np.nan, 0], [0, 1, 0]], NonFiniteVertexError, r"vertex 1 .*\(1, nan, 0\)"),
-        ([*TRIANGLE, [0, np.inf, 0], [np.inf] * 3], NonFiniteVertexError, r"vertex 3.*1 more"),
-        ([*TRIANGLE, TRIANGLE[2]], RepeatedVertexError, "vertices 2 and 3 .*: remove one"),
-        ([*TRIANGLE, TRIANGLE[0], TRIANGLE[0]], RepeatedVertexError, "vertices 3 and 0"),
-        (np.array(TRIANGLE) * 1e150, CurveScaleError, "choose units"),
-        (np.array(TRIANGLE) * 1e-150, CurveScaleError, "choose units"),
-        (np.broadcast_to(0.0, (20_000_000, 3)), TooManyVerticesError, "at most 10,000,000"),
+        ([], "there are no loops"),
+        (np.zeros((0, 3)), "0 different vertices"),
+        (TRIANGLE[:2], "2 different vertices"),
+        ([[1, 1, 1]] * 5, "1 different"),
+        (TRIANGLE[:2] * 3, "2 different"),
+        ([TRIANGLE, TRIANGLE[:2]], "loop 1 has 2"),
+        ([[0, 0], [1, 0], [0, 1]], r"not \(3, 2\); append a column of zeros"),
+        (np.zeros((3, 7)), r"not \(3, 7\); transpose it"),
+        ([0.0, 1.0, 2.0], r"must have shape \(n, 3\), not \(3,\)"),
+        (np.zeros((2, 2, 2, 3)), r"must have shape \(n, 3\)"),
+        ([[0, 0, 0], [1, 0], [0, 1, 0]], "every vertex needs three coord"),
+        ([TRIANGLE, [[0, 0, 0], [1, 0]]], "loop 1 is ragged"),
+        ([TRIANGLE, [[0, 0], [1, 0], [1, 1]]], "loop 1 must have shape"),
+        ("abc", "must hold real numbers"),
+        (None, "must hold real numbers"),
+        (np.array(TRIANGLE) * 1j, "must hold real numbers"),
+        ([[0, 0, 0], [1, np.nan, 0], [0, 1, 0]], r"vertex 1 .*\(1, nan, 0\)"),
+        ([*TRIANGLE, [0, np.inf, 0], [np.inf] * 3], r"vertex 3.*1 more"),
+        ([*TRIANGLE, TRIANGLE[2]], "vertices 2 and 3 .*: remove one"),
+        ([*TRIANGLE, TRIANGLE[0], TRIANGLE[0]], "vertices 3 and 0"),
+        (np.array(TRIANGLE) * 1e150, "choose units"),
+        (np.array(TRIANGLE) * 1e-150, "choose units"),
+        (np.broadcast_to(0.0, (20_000_000, 3)), "at most 10,000,000"),
     ],
 )
-def test_each_bad_curve_has_its_own_error(loops, error, message):
-    with pytest.raises(error, match=message) as caught:
+def test_each_bad_curve_has_its_own_message(loops, message):
+    with pytest.raises(CurveError, match=message):
         validate_loops(loops)
-    assert isinstance(caught.value, CurveError)
-    assert isinstance(caught.value, ValueError)
 
 
 def test_measures_of_a_curve():

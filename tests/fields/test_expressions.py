@@ -12,7 +12,7 @@ import pytest
 
 import harnack as hk
 from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
-from harnack.testing.violation_search import mutated_enclosure
+from tests.oracles.mutated_enclosure import mutated_enclosure
 
 POINTS = np.random.default_rng(2).uniform(-0.9, 0.9, (200, 3))
 

@@ -292,11 +292,11 @@ def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
     inside = hk.solid(hk.DipolePotential(points, normals, areas), above=2 * math.pi)
     solid = (inside.scaled(2.0) - knot.translated((1.0, 0, 0))).offset(0.01)
     assert solid.for_ray_count(1000) is solid
-    assert not knot.has_variable_accuracy
+    assert knot.variable_accuracy is None
     many = solid.for_ray_count(10**8)
     assert many.for_ray_count(10) is many
     assert solid.for_ray_count(10**8) is many
-    assert knot.for_ray_count(10**8).has_variable_accuracy
+    assert knot.for_ray_count(10**8).variable_accuracy is not None
     o = np.random.default_rng(3).normal(size=(2000, 3)) * 0.2 + [0.0, 0.0, 6.0]
     d = np.random.default_rng(4).uniform(-2, 2, (2000, 3)) - o
     hits, same = (
@@ -523,7 +523,9 @@ def test_solids_of_a_sum_sample_it_as_coarsely_as_the_sum_itself() -> None:
     cloud = hk.DipolePotential(points, points, cells=False)
     solid = hk.solid(cloud, above=2 * math.pi)
     backend = choose_backend("single")
-    coarsest = cloud.prepare(backend).coarsest_accuracy
+    coarsest = cloud.prepare(backend).variable_accuracy.coarsest
     assert coarsest < 1
-    assert solid.prepare(backend).coarsest_accuracy == coarsest
-    assert (solid | solid.translated((5, 0, 0))).prepare(backend).coarsest_accuracy == coarsest
+    for made_of_it in (solid, solid | solid.translated((5, 0, 0))):
+        sampling = made_of_it.prepare(backend).variable_accuracy
+        assert sampling is not None
+        assert sampling.coarsest == coarsest

@@ -72,7 +72,7 @@ def grid(height: Any) -> trimesh.Trimesh:
 
 def test_which_meshes_are_sheets() -> None:
     def is_sheet(part: trimesh.Trimesh, level: float = 0.5) -> bool:
-        return field(part).is_of_sheets_alone((level,))
+        return field(part).is_whole_surface((level,))
 
     flat = grid(lambda x, y: 0 * x)
     assert is_sheet(sheet())
@@ -155,7 +155,7 @@ def test_what_was_written_is_read_back(level: float) -> None:
     written: Any = result.export(file_type="stl")
     w = field(trimesh.load(io.BytesIO(written), file_type="stl"))  # pyright: ignore
     levels = (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
-    of = [one_level for one_level in levels if w.is_of_sheets_alone((one_level,))]
+    of = [one_level for one_level in levels if w.is_whole_surface((one_level,))]
     assert of in ([[-0.5, 0.5]] if level > 6 else [[-0.75, 0.25], [-0.25, 0.75]])
     for one_level in of:
         assert hk.mesh(w, level=one_level).area == pytest.approx(result.area, rel=1e-6)

@@ -354,7 +354,7 @@ def test_edges_run_both_ways_are_not_there(name: str, precision: str) -> None:
     for one, two in (
         (field.evaluate(p).gradient, other.evaluate(p).gradient),
         (field.hessian(p)[0], other.hessian(p)[0]),
-        (field.closest_boundary_point(p), other.closest_boundary_point(p)),
+        (field.boundary.closest_point(p), other.boundary.closest_point(p)),
     ):
         np.testing.assert_allclose(to_numpy(one), to_numpy(two), rtol=1e-3, atol=1e-4)
 
@@ -402,7 +402,7 @@ def test_a_curve_that_cancels_as_a_whole_has_no_surface(
     assert (to_numpy(field.evaluate(p).gradient) == 0).all()
     assert all((to_numpy(row) == 0).all() for row in field.hessian(p))
     assert (to_numpy(field.differentiable_value(p)) == 0).all()
-    assert field.closest_boundary_point(p) is None
+    assert field.boundary is None
     assert field.describe()["canceled edges"] == sum(map(len, NOTHING[name]))
     for level in (0.0, FOUR_PI, -2 * FOUR_PI):
         with pytest.raises(ValueError, match="cancel"):

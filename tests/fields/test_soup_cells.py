@@ -272,7 +272,7 @@ def test_when_there_are_cells_of_triangles() -> None:
     prepared = field.for_ray_count(20_000).prepare(choose_backend("single"))
     cells = cells_of(prepared)
     assert prepared.describe()["cells"] == f"{cells.count} of {cells.size / 1e6:.1f} MB"
-    assert not prepared.has_unknown_branch
+    assert prepared.modulo_one is None
     short = soup(mesh, 0.01).prepare(choose_backend("single"))
     assert short.describe()["cells"] == "none, as they need more memory"
     coarse = cells_of(soup(mesh, 2.0).prepare(choose_backend("single")))
@@ -288,7 +288,7 @@ def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
         prepared = soup(mesh).prepare(choose_backend("single"))
         assert prepared._device is not None
         assert prepared._device.cells is not None
-        assert prepared.has_unknown_branch
+        assert prepared.modulo_one is not None
     monkeypatch.setattr(winding_number, "_MOST_OF_SOUP", 100)
     assert soup(torn(2, 0.01), None).for_ray_count(10**9).cells is None
     assert soup(icosphere(1), True).prepare(choose_backend("single")).describe()["triangles"] == 80

@@ -181,10 +181,10 @@ def test_when_there_are_cells() -> None:
     assert field.for_ray_count(10**6) is field.for_ray_count(2 * 10**6)
     prepared = field.for_ray_count(10**6).prepare(choose_backend("single"))
     assert prepared.describe()["cells"].endswith("MB")
-    assert prepared.has_unknown_branch
+    assert prepared.modulo_one is not None
     short = with_cells(mesh, 0.01).prepare(choose_backend("single"))
     assert short.describe()["cells"] == "none, as they need more memory"
-    assert not short.has_unknown_branch
+    assert short.modulo_one is None
     assert hk.WindingNumber(*icosphere(1)).for_ray_count(10**9).cells is None
     assert with_cells(mesh, False).for_ray_count(10**9).cells is False
     with pytest.raises(ValueError, match="megabytes"):
@@ -353,7 +353,7 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     ])  # fmt: skip
     points = points.astype(backend.dtype).astype(np.float64)
     x = to_vector3(backend, points)
-    found = prepared.value_if_cheap(x, backend.Float(0), backend.Bool(True))
+    found = prepared.modulo_one.value_if_cheap(x, backend.Float(0), backend.Bool(True))
     value = to_numpy(found).astype(np.float64)
     known = np.isfinite(value)
     assert known[:n].mean() > 0.9

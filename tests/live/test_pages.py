@@ -18,7 +18,9 @@ import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import torus_mesh
+from harnack.live.shading_data import shader_constants
 from harnack.live.sliders import SlidingContent
+from harnack.rendering import shading
 from harnack.webgpu import NoDeviceError, find_device
 from harnack.webgpu.device import CompiledShader
 from harnack.webgpu.wgsl import Shader
@@ -47,9 +49,18 @@ def run(surface: dict[str, Any], data: Any) -> tuple[Any, Any]:
     places = surface["results"]
     outputs = tuple(map(str, range(sum(place < 99 for place in places))))
     program: CompiledShader = device.compile(Shader(surface["code"], (), (), names, outputs))
-    given = program._dispatch(data, lanes)
+    given = program.run_words(data, lanes)
     found = np.array([0 * given[0] if place == 99 else given[place] for place in places])
     return words(surface["check"]["results"]).reshape(7, -1), found
+
+
+def test_shaders_have_the_constants_of_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shading, "KEY_WRAP", 0.125)
+    assert "\nconst KEY_WRAP = 0.125;\n" in page_module.passes()
+    shaders = page_module.resource("passes.wgsl")
+    names = re.findall(r"^const (\w+) = ", shader_constants(), re.MULTILINE)
+    assert [name for name in names if not re.search(rf"\b{name}\b", shaders)] == []
+    assert [name for name in names if f"const {name} =" in shaders] == []
 
 
 @pytest.mark.parametrize("name", ["trefoil", "gyroid"])

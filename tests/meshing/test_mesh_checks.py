@@ -14,7 +14,7 @@ import harnack as hk
 from harnack.cli.mesh_files import write_mesh
 from harnack.geometry.example_meshes import bumpy_sphere
 from harnack.meshing.checks import check_inside, check_near_level, check_no_self_intersection
-from harnack.meshing.closed_mesh import ClosedMesh
+from harnack.meshing.closed_export import ClosedMesh
 from harnack.meshing.finishing import simplify_mesh
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.meshing_errors import LocalizedMeshingError, MeshingError, TriangleLimitError

@@ -16,12 +16,12 @@ from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.testing.violation_search import (
     BrokenPromiseError,
     lift_along_rays,
-    original_enclosure,
     random_directions,
     random_points,
     sample_field,
 )
 from tests.oracles.exact import exact_step, on_host
+from tests.oracles.mutated_enclosure import original_enclosure
 
 if TYPE_CHECKING:
     from harnack.backend import Precision

@@ -14,6 +14,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 # Each room imports from itself and from the rooms before it.
 ROOMS = (
     "name_suggestions",
+    "optional_packages",
     "progress",
     "backend",
     "webgpu",
@@ -24,6 +25,7 @@ ROOMS = (
     "arithmetic",
     "enclosures",
     "fields",
+    "literature",
     "tracer",
     "distance",
     "meshing",
@@ -37,6 +39,7 @@ ROOMS = (
 FIELD_ROOMS = (
     "capabilities",
     "batch_evaluation",
+    "parameters",
     "samples",
     "field",
     "formula",
@@ -142,6 +145,23 @@ def test_families_of_fields_do_not_know_each_other() -> None:
             if later or (target in FAMILIES and target != room):
                 wrong.append(f"{path.name} imports harnack.{'.'.join(module)}")
     assert wrong == []
+
+
+def test_nothing_imports_the_literature() -> None:
+    """It is there for comparison. Its names are data in one table, from which it is imported when
+    one of them is asked for."""
+    others = [path for path in FILES if path.relative_to(SOURCE).parts[0] != "literature"]
+    texts = {path: path.read_text(encoding="utf-8") for path in others}
+    assert len(texts) < len(FILES)
+    wrong = [
+        f"{path.name} imports harnack.{'.'.join(module)}"
+        for path, source in texts.items()
+        for module in imported_modules(ast.parse(source), ("harnack",))
+        if module[:1] == ("literature",)
+    ]
+    assert wrong == []
+    table = SOURCE / "enclosures/selection.py"
+    assert [path for path, source in texts.items() if "harnack.literature" in source] == [table]
 
 
 def rendering_imports() -> dict[tuple[str, ...], set[tuple[str, ...]]]:

@@ -8,8 +8,8 @@ import pytest
 import harnack as hk
 from benchmarks import baselines, blobs, formulas, hart, inclusion, povray
 from harnack.backend import choose_backend, to_vector3
-from harnack.enclosures.literature import BottomUpLinearEnclosure
 from harnack.geometry import example_curves
+from harnack.literature import BottomUpLinearEnclosure
 
 SCENE = blobs.Scene.random(6, 1.5, (0.6, 1.0), 1.6, seed=2)
 

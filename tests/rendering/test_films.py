@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-import builtins
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -205,14 +205,8 @@ def test_what_is_no_number_is_named(settings: dict[str, Any], tmp_path: Path) ->
 
 
 def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = builtins.__import__
-
-    def without(name: str, *rest: Any) -> Any:
-        if name in ("av", "PIL"):
-            raise ModuleNotFoundError(name)
-        return usual(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    for module in ("av", "PIL.Image"):
+        monkeypatch.setitem(sys.modules, module, None)
     for name in ("a.gif", "a.mp4"):
         with pytest.raises(ModuleNotFoundError, match=r"harnack\[film\]"):
             hk.animate(FIELD, tmp_path / name, frames=2, **SMALL)

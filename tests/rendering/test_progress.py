@@ -7,13 +7,14 @@ import sys
 import pytest
 import rich.console
 
+import harnack as hk
 from harnack import progress
 
 
 def finish_two_parts() -> None:
-    with progress.progress_bar("rendering", progress=True) as advance:
-        advance(0.25)
-        advance(0.75)
+    with progress.show_progress("rendering", progress=True) as reporter:
+        reporter.advance(0.25)
+        reporter.advance(0.75)
 
 
 def test_notebooks_get_text_without_ipywidgets(
@@ -45,6 +46,24 @@ def test_none_is_shown_where_none_is_wanted(
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
-    with progress.progress_bar("rendering", progress=False) as advance:
-        advance(0.5)
+    with progress.show_progress("rendering", progress=False) as reporter:
+        reporter.advance(0.5)
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_function_gets_texts_and_what_is_done() -> None:
+    told: list[hk.Progress] = []
+    with progress.show_progress("rendering", told.append) as reporter:
+        reporter.advance(0.25)
+        reporter.tell("cells")
+        reporter.advance(0.75)
+    assert told == ["rendering: 25%", "cells", "rendering: 100%"]
+    assert [one.done for one in told] == [0.25, None, 1.0]
+
+
+def test_texts_are_printed_in_log_files(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
+    hk.mesh(hk.Sphere(1.0), cell_size=0.5, tolerance=0.1, progress=True)
+    assert "mesh: " in capsys.readouterr().err

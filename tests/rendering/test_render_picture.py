@@ -337,9 +337,14 @@ def in_a_new_process(code: str) -> str:
 
 
 @pytest.mark.slow
-def test_mitsuba_is_imported_only_to_draw() -> None:
-    code = "import sys, harnack, harnack.rendering; print('mitsuba' in sys.modules)"
-    assert in_a_new_process(code) == "False"
+def test_large_libraries_are_imported_where_they_are_used() -> None:
+    code = """
+import sys, harnack, harnack.cli
+harnack.trace, harnack.mesh, harnack.render, harnack.files, harnack.distance
+large = {"dask", "gemmi", "manifold3d", "matplotlib", "mitsuba", "PIL", "scipy", "trimesh"}
+print(sorted(large & set(sys.modules)))
+"""
+    assert in_a_new_process(code) == "[]"
 
 
 DRAW = """

@@ -212,7 +212,7 @@ def positions(bend: float) -> tuple[Any, Any]:
 
 
 def test_a_plane_hides_nothing_and_a_wall_hides_what_is_near(monkeypatch: Any) -> None:
-    monkeypatch.setattr("harnack.rendering.shaded_render._REACH", 0.4)
+    monkeypatch.setattr("harnack.rendering.shaded_render.SKY_REACH", 0.4)
     flat = np.array(ambient_visibility(mi, *positions(0.0), mi.Float(1), (41, 41))).reshape(41, 41)
     np.testing.assert_allclose(flat, 1, atol=1e-6)
     bent = np.array(ambient_visibility(mi, *positions(2.0), mi.Float(1), (41, 41))).reshape(41, 41)

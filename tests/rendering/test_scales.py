@@ -212,6 +212,6 @@ def test_what_is_wrong_is_said(settings: dict[str, Any], message: str) -> None:
 
 
 def test_without_pillow_a_bar_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "PIL", None)
+    monkeypatch.setitem(sys.modules, "PIL.Image", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'harnack\[film\]'"):
         hk.render(SPHERE, show="depth", color_bar=True, **SMALL)

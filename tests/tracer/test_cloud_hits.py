@@ -145,7 +145,7 @@ def test_a_tree_that_hides_its_error_misses_hits() -> None:
     class Sure(hk.DipolePotential):
         """As coarse as can be, and nothing said of it."""
 
-        has_variable_accuracy = False
+        variable_accuracy = None  # type: ignore[assignment]
 
         def evaluate(self, p: Any) -> hk.fields.Sample:
             sample = super().evaluate(p)

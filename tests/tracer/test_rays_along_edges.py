@@ -56,8 +56,10 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
     o, along = to_vector3(backend, x), to_vector3(backend, d)
     start = backend.Float(-1e-20)
     first = JumpCrossing(start, backend.UInt32(NO_FACET), backend.Float(0), along)
-    turns = field.initial_offset(o, along, start, backend.Bool(True))
-    promises = field.continuation(o, along, first, first, turns).evaluate(o).ray_promises
+    jumps = field.jumps
+    assert jumps is not None
+    turns = jumps.initial_offset(o, along, start, backend.Bool(True))
+    promises = jumps.continuation(o, along, first, first, turns).evaluate(o).ray_promises
     gain = 0.0
     for promise in promises:
         rate, length = to_numpy(promise.constant) * 4 * math.pi, to_numpy(promise.radius)

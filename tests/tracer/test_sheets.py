@@ -38,12 +38,12 @@ from harnack.fields import Field, Sample
 from harnack.fields.capabilities import NO_FACET, JumpCrossing
 from harnack.fields.samples import Ray as RayPath
 from harnack.rendering.surface_hits import intersect_surface
-from harnack.testing import mutated_enclosure
 from harnack.testing.enclosure_contracts import PromiseCase
 from harnack.tracer import traced_surface
 from harnack.tracer.level_contact import test_jump as jump_test
 from tests.oracles.exact import exact_step, on_host
 from tests.oracles.jump_oracle import first_side_changes, judge
+from tests.oracles.mutated_enclosure import mutated_enclosure
 
 FOUR_PI = 4 * math.pi
 
@@ -123,8 +123,12 @@ class BruteForceWinding(hk.Field):
     edges that do not cancel. jump: a factor that spoils what is said of jumps, 1 for the truth.
     """
 
-    has_jumps = True
     default_level = 0.5
+    counts_crossings = False
+
+    @property
+    def jumps(self) -> BruteForceJumps:
+        return BruteForceJumps(self)
 
     def __init__(self, vertices: Any, faces: Any, *, jump: float = 1.0) -> None:
         self.vertices = np.asarray(vertices, np.float32).astype(np.float64)
@@ -196,16 +200,23 @@ class BruteForceWinding(hk.Field):
             variation += n * fmin(length / (left * left), 2 / left)
         return gradient / FOUR_PI, near, variation / FOUR_PI
 
-    def next_jump(
+
+class BruteForceJumps(hk.fields.Jumps):
+    """The crossings of rays with the triangles of a field, each triangle tested by itself."""
+
+    def __init__(self, field: BruteForceWinding) -> None:
+        self.field = field
+
+    def next_crossing(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         best = JumpCrossing(type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_FACET), 0 * o.x, 0 * d)
-        passage = Passage.of(o, d, self.vertices, self.faces)
+        passage = Passage.of(o, d, self.field.vertices, self.field.faces)
         for i, (t, side) in enumerate(passage.crossings):
             later = (t > after.t) | ((t == after.t) & (after.facet < i))
             better = active & (side != 0) & later & (t <= t_max) & (t < best.t)
-            normal = -self._normal(d, i)
-            found = (t, i, -self.jump * side, normal)
+            normal = -self.field._normal(d, i)
+            found = (t, i, -self.field.jump * side, normal)
             mine = (best.t, best.facet, best.jump, best.normal)
             best = JumpCrossing(
                 *(dr.select(better, x, y) for x, y in zip(found, mine, strict=True))
@@ -215,10 +226,17 @@ class BruteForceWinding(hk.Field):
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> BruteForceWinding:
-        other = type(self)(self.vertices, self.faces)
-        passage = Passage.of(o, d, self.vertices, self.faces)
+        other = type(self.field)(self.field.vertices, self.field.faces)
+        passage = Passage.of(o, d, self.field.vertices, self.field.faces)
         other.stretch = Stretch(d, passage, behind, offset)
         return other
+
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        del active
+        if not self.field.counts_crossings:
+            return 0.0
+        passage = Passage.of(o, d, self.field.vertices, self.field.faces)
+        return sum(dr.select(t > t_min, side, 0) for t, side in passage.crossings)
 
 
 def frame(d: Vec3) -> tuple[Vec3, Vec3]:
@@ -247,10 +265,7 @@ class CountedWinding(BruteForceWinding):
     triangles, taken as they appear, is off.
     """
 
-    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        del active
-        passage = Passage.of(o, d, self.vertices, self.faces)
-        return sum(dr.select(t > t_min, side, 0) for t, side in passage.crossings)
+    counts_crossings = True
 
     def _seen(self, i: int, im: Real) -> Real:
         del i
@@ -529,7 +544,9 @@ def test_a_level_that_a_jump_cuts_off_is_within_reach_or_not(short: float, early
 class Staircase(hk.Field):
     """slope * x, and a jump at each of some planes x = const: all steps are known exactly."""
 
-    has_jumps = True
+    @property
+    def jumps(self) -> StaircaseJumps:
+        return StaircaseJumps(self)
 
     def __init__(self, slope: float, planes: dict[float, float], lift: Real | None = None) -> None:
         self.slope, self.planes, self.lift = slope, planes, lift
@@ -543,11 +560,18 @@ class Staircase(hk.Field):
             self.slope * p.x + lift, gradient, (hk.proofs.Lipschitz(abs(self.slope)),)
         )
 
-    def next_jump(
+
+class StaircaseJumps(hk.fields.Jumps):
+    """The planes at which a staircase jumps."""
+
+    def __init__(self, field: Staircase) -> None:
+        self.field = field
+
+    def next_crossing(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         t, sheet, jump = type(o.x)(dr.inf), dr.uint32_array_t(o.x)(NO_FACET), type(o.x)(0)
-        for i, (x, height) in enumerate(self.planes.items()):
+        for i, (x, height) in enumerate(self.field.planes.items()):
             there = (x - o.x) / d.x
             later = (there > after.t) | ((there == after.t) & (after.facet < i))
             better = active & later & (there <= t_max) & (there < t)
@@ -558,7 +582,7 @@ class Staircase(hk.Field):
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         del active
         total = type(o.x)(0)
-        for x, height in self.planes.items():
+        for x, height in self.field.planes.items():
             is_ahead = (x - o.x) / d.x > t_min
             total += dr.select(is_ahead == (d.x > 0), 0, height)
         return total
@@ -567,7 +591,7 @@ class Staircase(hk.Field):
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Staircase:
         del o, d, behind, ahead
-        return Staircase(self.slope, self.planes, offset)
+        return Staircase(self.field.slope, self.field.planes, offset)
 
 
 @pytest.mark.few(1)
@@ -867,12 +891,7 @@ def test_occlusion_is_a_hit() -> None:
     assert 50 < blocked.sum() < 300
 
 
-def test_fields_without_sheets_are_not_asked_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any) -> None:
-        raise AssertionError("asked")
-
-    for name in ("next_jump", "continuation", "initial_offset"):
-        monkeypatch.setattr(hk.Field, name, fail)
+def test_fields_without_sheets_have_no_facets() -> None:
     o, d = rays(CUBE, 50)
     hits = hk.trace(hk.Gyroid(domain=hk.Ball(radius=3.0)), o, d)
     assert hits.is_hit.any()
@@ -881,13 +900,11 @@ def test_fields_without_sheets_are_not_asked_for_them(monkeypatch: pytest.Monkey
     assert hk.trace(hk.Gyroid(), o[:0], d[:0]).primitive_index.shape == (0,)
 
 
-def test_defaults_know_no_sheets() -> None:
-    field, backend = hk.Gyroid(), choose_backend("single")
-    one, ray = backend.Float(1), backend.Array3f(1, 0, 0)
-    start = JumpCrossing(one, backend.UInt32(NO_FACET), one, ray)
-    assert field.next_jump(ray, ray, start, one, backend.Bool(True)).t == math.inf
-    assert field.continuation(ray, ray, start, start, one) is field
-    assert field.distance_to_jumps(ray) == math.inf
+def test_jumps_without_distances_are_refused() -> None:
+    field = Staircase(1.0, {0.5: 1.0})
+    assert not field.jumps.gives_distances
+    with pytest.raises(NotImplementedError, match="define its method distance"):
+        field.jumps.distance(choose_backend("single").Array3f(1, 0, 0))
 
 
 # --- a level on the value of a side ---------------------------------------------------------
@@ -972,8 +989,10 @@ def test_the_level_moves_smooth_hits_only() -> None:
 
 def test_derivatives_by_parameters_are_refused() -> None:
     class Moving(BruteForceWinding):
-        def parameters(self) -> tuple[Any, ...]:
-            return (where,)
+        has_parameter_derivatives = True
+
+        def parameters(self) -> dict[str, Any]:
+            return {"where": where}
 
     backend = choose_backend("double")
     where = backend.Array3f(0, 0, 0)

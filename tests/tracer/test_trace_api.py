@@ -13,10 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend
 from harnack.geometry import example_curves
 from harnack.geometry.curves import (
-    CurveShapeError,
-    NonFiniteVertexError,
-    RepeatedVertexError,
-    TooFewVerticesError,
+    CurveError,
 )
 
 SQUARE = np.array([[1.0, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
@@ -385,20 +382,20 @@ def test_a_level_that_no_surface_has(field: hk.Field, level: Any, message: str) 
 
 
 @pytest.mark.parametrize(
-    ("vertices", "error", "message"),
+    ("vertices", "message"),
     [
-        (SQUARE[:2], TooFewVerticesError, "at least 3"),
-        (SQUARE[[0, 1, 0, 1]], TooFewVerticesError, "2 different vertices"),
-        (SQUARE[[0, 1, 1, 2]], RepeatedVertexError, "vertices 1 and 2 of the loop are both"),
-        (np.where(SQUARE == 1, math.nan, SQUARE), NonFiniteVertexError, "must be finite"),
-        (SQUARE[:, :2], CurveShapeError, "append a column of zeros"),
-        (SQUARE.T, CurveShapeError, "transpose it"),
-        ([], CurveShapeError, "there are no loops"),
-        ([SQUARE, SQUARE[:2]], TooFewVerticesError, "loop 1"),
+        (SQUARE[:2], "at least 3"),
+        (SQUARE[[0, 1, 0, 1]], "2 different vertices"),
+        (SQUARE[[0, 1, 1, 2]], "vertices 1 and 2 of the loop are both"),
+        (np.where(SQUARE == 1, math.nan, SQUARE), "must be finite"),
+        (SQUARE[:, :2], "append a column of zeros"),
+        (SQUARE.T, "transpose it"),
+        ([], "there are no loops"),
+        ([SQUARE, SQUARE[:2]], "loop 1"),
     ],
 )
-def test_bad_curves(vertices: Any, error: type[ValueError], message: str) -> None:
-    with pytest.raises(error, match=message):
+def test_bad_curves(vertices: Any, message: str) -> None:
+    with pytest.raises(CurveError, match=message):
         hk.SolidAngle(vertices)
 
 

@@ -7,13 +7,16 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.backend import choose_backend, to_numpy
 from harnack.geometry.example_meshes import icosphere
 from harnack.tracer import hits as tracing
-from harnack.webgpu import DeviceMismatchError, NoDeviceError, find_device
+from harnack.webgpu import Device, DeviceMismatchError, NoDeviceError, find_device, record_kernel
+from harnack.webgpu import device as device_module
 from tests.fields.test_contracts import APPROXIMATE, FIELDS
 from tests.fields.test_shapes import SHAPES
 
@@ -150,3 +153,36 @@ def test_few_rays_and_many() -> None:
         )
     none = hk.trace(field, np.zeros((0, 3)), np.zeros((0, 3)), backend="webgpu")
     assert len(none.t) == 0
+
+
+class Uploads:
+    """A device's handle that notes the sizes of what is uploaded in buffers of their own."""
+
+    def __init__(self, handle: Any) -> None:
+        self.handle, self.sizes = handle, list[int]()
+
+    def create_buffer_with_data(self, *, data: Any, usage: Any) -> Any:
+        self.sizes.append(data.nbytes)
+        return self.handle.create_buffer_with_data(data=data, usage=usage)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.handle, name)
+
+
+def test_tables_are_uploaded_once_for_all_dispatches(monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = choose_backend("single")
+    x, table = backend.Float(np.arange(640) / 64), backend.Float(np.arange(4096) ** 0.5)
+
+    def compute(x: Any) -> dict[str, Any]:
+        return {"y": dr.gather(backend.Float, table, backend.UInt32(x * 100)) + x}
+
+    recording = record_kernel(compute, {"x": x}, table)
+    uploads = Uploads(find_device().handle)
+    monkeypatch.setattr(device_module, "_INITIAL_BATCH", 64)
+    monkeypatch.setattr(device_module, "_MAX_BATCH", 64)
+    program = Device(uploads, "device").compile(recording.shader)
+    found = program.run(recording.data, {"lane x": to_numpy(x)})
+    expected = to_numpy(recording.results["result y"])
+    assert np.array_equal(found["result y"].view(np.float32), expected)
+    assert len([size for size in uploads.sizes if size > 4 * 4096]) == 1
+    assert len(uploads.sizes) == 1 + 10

@@ -1,20 +1,16 @@
 """Arithmetic of functions along a path: numbers that carry proved ranges, intervals that contain
-all values of a function. A path is a piece of a ray. There are intervals, jets (ranges of values
-and derivatives), parabolas and affine forms (lines with an error). A formula is written once and
-evaluated with any of them."""
+all values of a function. A path is a piece of a ray. There are intervals and jets (ranges of values
+and derivatives). A formula is written once and evaluated with any of them."""
 
 from __future__ import annotations
 
-from harnack.arithmetic.affine import AffineForm
 from harnack.arithmetic.angles import atan2
 from harnack.arithmetic.functions import (
-    ClippedPower,
     ElementaryFunction,
     absolute,
     acos,
     asin,
     atan,
-    clipped_power,
     cos,
     cosh,
     exp,
@@ -37,18 +33,14 @@ from harnack.arithmetic.norms import (
     norm,
     orthogonal_intersection,
 )
-from harnack.arithmetic.parabola_bounds import ParabolaBounds
 from harnack.arithmetic.values import Values
 
 __all__ = [
     "ONE",
     "ZERO",
-    "AffineForm",
-    "ClippedPower",
     "ElementaryFunction",
     "Interval",
     "Jet",
-    "ParabolaBounds",
     "Values",
     "absolute",
     "acos",
@@ -57,7 +49,6 @@ __all__ = [
     "atan2",
     "blend_intersection",
     "blend_union",
-    "clipped_power",
     "cos",
     "cosh",
     "exp",

@@ -19,7 +19,7 @@ from harnack.arithmetic.operators import FormulaNumber
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
 
-__all__ = ["angle_range", "approximate_direction", "atan2"]
+__all__ = ["angle_range", "atan2"]
 
 # A bound of the error of Dr.Jit's atan2, in units in the last place; measured: 3.3.
 _MAX_ULP_ERROR = 8.0
@@ -118,15 +118,3 @@ def _nan_to_infinite(x: Interval) -> Interval:
         dr.select(x.lower == x.lower, x.lower, -dr.inf),
         dr.select(x.upper == x.upper, x.upper, dr.inf),
     )
-
-
-def approximate_direction(x: Real, y: Real) -> tuple[Real, Real]:
-    """A vector in about the direction of (x, y), of a length between 1/2 and 2. It is (1, 0) if (x,
-    y) is 0 or not finite."""
-    size = dr.maximum(dr.abs(x), dr.abs(y))
-    is_valid = (size > 0) & dr.isfinite(size)
-    scale = dr.select(is_valid, 1 / size, 0)
-    a, b = x * scale, y * scale
-    # The length is now between 1 and sqrt 2.
-    inverse_length = dr.rsqrt(dr.maximum(a * a + b * b, 1))
-    return dr.select(is_valid, a * inverse_length, 1), dr.select(is_valid, b * inverse_length, 0)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -23,8 +23,6 @@ from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-
-Number: TypeAlias = "Interval | float"
 
 
 @dataclass(frozen=True)
@@ -100,10 +98,6 @@ class Interval:
         contains 0."""
         return _maximum(-self.upper, _maximum(self.lower, 0.0))
 
-    def contains(self, x: Real) -> Mask:
-        """A mask of the lanes on which the number x lies in the interval."""
-        return ~((x < self.lower) | (x > self.upper))
-
     def hull(self, other: Interval) -> Interval:
         """The smallest interval that contains this interval and the other one."""
         low = -_maximum_or_nan(-self.lower, -other.lower)
@@ -118,10 +112,6 @@ class Interval:
             _minimum_ignoring_nan(self.upper, other.upper),
             self.is_single or other.is_single,
         )
-
-    def shifted(self, x: Real) -> Interval:
-        """The interval of all y + x for y in this interval, with the exact number x."""
-        return self + Interval(x, x)
 
     def __neg__(self) -> Interval:
         """The interval of all -x for x in the interval. The result for a point interval is a point

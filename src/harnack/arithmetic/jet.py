@@ -88,14 +88,12 @@ class Jet(FormulaNumber):
         start: Real,
         end: Real,
         *,
-        anchored: bool = True,
         is_rounded: bool = False,
     ) -> tuple[Jet, Jet, Jet]:
         """The three coordinates of the points p + s d as functions of s, on the piece start <= s <=
         end.
 
         direction: d.
-        anchored: whether ranges are narrowed from their values at the start of the piece.
         is_rounded: whether the path passes p only up to the rounding of p's coordinates. Ranges
             then hold for all such paths, each along d.
         """
@@ -109,7 +107,7 @@ class Jet(FormulaNumber):
             at_start = _moved(base, rate, start)
             first, second = (rate,), (ZERO,)
             # (0 * x is the number 0 in the type of x.)
-            anchor = Jet(at_start, first, second, piece_length=0 * x) if anchored else None
+            anchor = Jet(at_start, first, second, piece_length=0 * x)
             return Jet(at_start.hull(_moved(base, rate, end)), first, second, anchor, end - start)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))

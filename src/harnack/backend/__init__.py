@@ -8,16 +8,7 @@ before any other import of drjit: `harnack/__init__.py` imports it first.
 
 from __future__ import annotations
 
-from harnack.backend.llvm import (
-    LLVMLibrary,
-    LLVMNotFoundError,
-    best_library,
-    ensure_llvm,
-    find_libraries,
-    import_drjit,
-    library_version,
-    loaded_library,
-)
+from harnack.backend.llvm import LLVMNotFoundError, import_drjit
 
 import_drjit()  # loads LLVM with it, so it comes before whatever else imports drjit
 
@@ -45,20 +36,13 @@ __all__ = [
     "FloatArray",
     "Index",
     "IntArray",
-    "LLVMLibrary",
     "LLVMNotFoundError",
     "Mask",
     "Precision",
     "Real",
     "Vec3",
     "backend_of",
-    "best_library",
     "choose_backend",
-    "ensure_llvm",
-    "find_libraries",
-    "import_drjit",
-    "library_version",
-    "loaded_library",
     "to_float",
     "to_numpy",
     "to_vector3",

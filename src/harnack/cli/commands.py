@@ -109,11 +109,7 @@ def _mesh(arguments: Any) -> int:
         for name, value in given_options.items()
         if name not in SHORTHAND or name == "tolerance"
     }
-    if arguments.quiet:
-        triangles = mesh(surface, **settings)
-    else:
-        with Console().status("starting") as status:
-            triangles = mesh(surface, progress=status.update, **settings)
+    triangles = mesh(surface, progress=not arguments.quiet, **settings)
     facts = triangles.metadata["harnack"]
     if arguments.scale is not None:
         triangles.apply_scale(arguments.scale)
@@ -148,10 +144,7 @@ def _repair(arguments: Any) -> int:
     # joined.
     used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
     damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
-    with Console().status("starting") as status:
-        repaired = repair(
-            damaged, progress=None if arguments.quiet else status.update, **given_options
-        )
+    repaired = repair(damaged, progress=not arguments.quiet, **given_options)
     write_mesh(repaired, target)
     facts = repaired.metadata["harnack"]
     if facts["differs"] is not None:

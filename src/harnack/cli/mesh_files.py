@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harnack.files.file_geometry import check_writable, write_atomically
-from harnack.files.three_mf import REQUIRED_PACKAGES
+from harnack.files.three_mf import missing_packages
 
 if TYPE_CHECKING:
     import trimesh
@@ -31,13 +30,8 @@ def check_mesh_path(path: str | os.PathLike[str]) -> Path:
     target = Path(path)
     if target.suffix.lower() not in MESH_FILES:
         raise ValueError(f"{target} has no extension of a mesh: name it {', '.join(MESH_FILES)}")
-    if target.suffix.lower() == ".3mf":
-        missing = [name for name in REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]
-        if missing:
-            raise ImportError(
-                f"{target}: 3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]', or name "
-                "the file .stl"
-            )
+    if target.suffix.lower() == ".3mf" and (missing := missing_packages()):
+        raise ImportError(f"{target}: {missing}, or name the file .stl")
     check_writable(target)
     return target
 
@@ -52,7 +46,7 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> None:
         ValueError, ImportError, OSError: the path is refused by `check_mesh_path`.
         MeshingError: the mesh cannot be written as a closed one.
     """
-    from harnack.meshing.closed_mesh import ClosedMesh
+    from harnack.meshing.closed_export import ClosedMesh
 
     target = check_mesh_path(path)
     kind = target.suffix.lower()[1:]

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from harnack.cluster.serialization import SerializedObject, content_hash, import_optional
+from harnack.cluster.serialization import SerializedObject, content_hash, import_cluster_package
 from harnack.cluster.workers import exclusive_compute
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -78,8 +78,8 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
         TypeError: another argument is a Dask array, or a Dask array does not hold real numbers.
     """
     purpose = "Dask arrays"
-    delayed = import_optional("dask", purpose).delayed
-    dask_array = import_optional("dask.array", purpose)
+    delayed = import_cluster_package("dask", purpose).delayed
+    dask_array = import_cluster_package("dask.array", purpose)
     dask_args = {name: array for name, array in arguments.items() if is_dask_array(array)}
     for name in dask_args.keys() - set(names):
         raise TypeError(f"{name} cannot be a Dask array: call its method compute() first")

@@ -8,9 +8,9 @@ can be used again after a crash, with other workers, or for a film with more fra
 are not repeated, and results of other jobs are left alone.
 
 All jobs take the same path. A picture is always computed band by band, in this process or on Dask's
-workers (`shading`, `RenderExecutor`), so that the result is the same bit for bit. Steps that need
-the whole picture (hidden sky, outlines) run in the process that assembles it. A job is sent as a
-Dask task, not as data in a worker's memory, because such data would be lost with the worker.
+workers, so that the result is the same bit for bit. Steps that need the whole picture (hidden sky,
+outlines) run in the process that assembles it. A job is sent as a Dask task, not as data in a
+worker's memory, because such data would be lost with the worker.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from harnack.cluster.serialization import SerializedObject, content_hash, import_optional
+from harnack.cluster.serialization import SerializedObject, content_hash, import_cluster_package
 from harnack.cluster.workers import (
     SCHEDULER_LOST,
     connect_client,
@@ -114,16 +114,29 @@ class CheckpointFolder:
 
 @dataclass(frozen=True)
 class Executor:
-    """Runs the tasks of jobs; `open_executor` makes it.
+    """Runs the tasks of a job. `open_executor` makes one for a cluster or a checkpoint folder;
+    `Executor(job)` calls the job's methods in this process.
 
+    job: the object whose methods are called. With a client or a checkpoint, it must be one that
+        `SerializedObject.serialize` accepts, and its methods return arrays by name. It is sent to
+        each worker once, and deserialized there once.
     client: a Dask client whose workers run the tasks; None to run them in this process.
     checkpoint: the folder that stores results; None for no folder.
     chunks: the number of tasks that a job is split into; None for a number that suits the workers.
+    decode: turns the arrays that a task of the method with the given name returned into the result;
+        None to leave them as they are.
     """
 
+    job: Any
     client: Any = None
     checkpoint: CheckpointFolder | None = None
     chunks: int | None = None
+    decode: Callable[[str, TaskResult], Any] | None = None
+
+    @property
+    def is_local(self) -> bool:
+        """Whether tasks are plain calls in this process, whose results are stored nowhere."""
+        return self.client is None and self.checkpoint is None
 
     def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
         """Split range(count) into intervals (start, stop) of at most `max_size` numbers each; each
@@ -137,25 +150,25 @@ class Executor:
             size = max(1, min(size, -(-count // (_TASKS_PER_THREAD * self._threads()))))
         return [(start, min(start + size, count)) for start in range(0, count, size)]
 
-    def run_tasks(
-        self, job: Any, step: str, parts: Sequence[tuple[Any, ...]]
-    ) -> Iterator[TaskResult]:
-        """Call the method `step` of a job with the arguments of each part, and yield the results in
-        the order of the parts.
+    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
+        """Call the method `step` of the job with the arguments of each part, and yield the results
+        in the order of the parts. In this process each is computed when it is asked for.
 
-        job: an object that `SerializedObject.serialize` accepts. It is sent to each worker once,
-            and deserialized there once.
-        step: the name of a method that returns arrays by name.
+        step: the name of the method.
         parts: for each task, a tuple of the method's arguments.
 
         Raises the errors of the method.
         """
-        if self.client is None and self.checkpoint is None:
-            method: TaskFunction = getattr(job, step)
-            for part in parts:
-                yield method(*part)
-            return
-        packed = SerializedObject.serialize(job, "checkpoint" if self.client is None else "client")
+        method = getattr(self.job, step)
+        plain_calls = (method(*part) for part in parts)
+        for result in plain_calls if self.is_local else self._run_named(step, parts):
+            yield result if self.decode is None else self.decode(step, result)
+
+    def _run_named(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[TaskResult]:
+        """Do what `run_tasks` does by tasks that have names, by which their results are stored."""
+        packed = SerializedObject.serialize(
+            self.job, "checkpoint" if self.client is None else "client"
+        )
         names = [f"{packed.content_hash}-{step}-{content_hash(part, 'a part')}" for part in parts]
         runner = (
             _LocalTasks(packed, step)
@@ -182,11 +195,12 @@ class Executor:
 
 @contextmanager
 def open_executor(
-    client: Any = None, checkpoint: Any = None, chunks: int | None = None
+    job: Any, client: Any = None, checkpoint: Any = None, chunks: int | None = None
 ) -> Generator[Executor]:
-    """Context manager that yields an `Executor` for the workers of a Dask cluster or for this
-    process.
+    """Context manager that yields an `Executor` of a job for the workers of a Dask cluster or for
+    this process.
 
+    job: the object whose methods are called, as for `Executor`.
     client: a Dask client, the address of a scheduler, or None for this process.
     checkpoint: the path of a folder that stores results, or None.
     chunks: the number of tasks that a job is split into; None for a number that suits the workers.
@@ -199,10 +213,10 @@ def open_executor(
     """
     folder = None
     if checkpoint is not None:
-        import_optional("cloudpickle", "checkpoint")
+        import_cluster_package("cloudpickle", "checkpoint")
         folder = CheckpointFolder.open(checkpoint)
     with connect_client(client) as dask_client:
-        yield Executor(dask_client, folder, chunks)
+        yield Executor(job, dask_client, folder, chunks)
 
 
 class _LocalTasks:
@@ -248,11 +262,13 @@ class _DaskTasks:
     def __init__(self, client: Any, packed: SerializedObject, step: str) -> None:
         """Send the serialized job `packed` to the cluster of `client`. step: the name of the job's
         method that a task calls."""
-        distributed = import_optional("distributed", "client")
+        distributed = import_cluster_package("distributed", "client")
         self.client, self.step = client, step
         # Classes of errors of Dask, by which lost workers and a lost scheduler are recognized.
         self.worker_lost = distributed.KilledWorker
-        self.scheduler_lost = import_optional("distributed.client", "client").FuturesCancelledError
+        self.scheduler_lost = import_cluster_package(
+            "distributed.client", "client"
+        ).FuturesCancelledError
         self.completed = distributed.as_completed(loop=client.loop)
         self.names: dict[Any, str] = {}
         self.checked_workers = set(worker_threads(client))

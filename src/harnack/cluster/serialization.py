@@ -21,7 +21,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import importlib
 import importlib.metadata
 import io
 import os
@@ -48,6 +47,7 @@ from harnack.cluster.users_code import (
     refuse_imports_within,
     words_of,
 )
+from harnack.optional_packages import import_optional
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -69,7 +69,7 @@ _MISSING_MESSAGE = (
 )
 
 
-def import_optional(name: str, feature: str) -> Any:
+def import_cluster_package(name: str, feature: str) -> Any:
     """Import a module that the extra `cluster` of this package installs.
 
     feature: the feature that needs it, for the message.
@@ -77,10 +77,7 @@ def import_optional(name: str, feature: str) -> Any:
     Raises:
         ModuleNotFoundError: it is not installed.
     """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(_MISSING_MESSAGE.format(feature=feature)) from error
+    return import_optional(name, _MISSING_MESSAGE.format(feature=feature))
 
 
 @functools.cache
@@ -92,8 +89,14 @@ def package_versions() -> str:
 
 
 class TransientCache(dict[Key, Value]):
-    """A dictionary in which an object caches computed values. It is empty in copies and pickles of
-    the object."""
+    """A dictionary in which an object caches computed values, as long as it lives: a
+    `functools.cached_property` for each key. It is empty in copies and pickles of the object."""
+
+    def get_or_make(self, key: Key, make: Callable[[], Value]) -> Value:
+        """Return the value of a key; without one, that of `make()`, which is then kept."""
+        if key not in self:
+            self[key] = make()
+        return self[key]
 
     def __reduce__(self) -> Any:
         """Return how pickle rebuilds the cache: as an empty one."""
@@ -237,7 +240,7 @@ def _pickle(
     Raises:
         TypeError: the value cannot be pickled.
     """
-    cloudpickle = import_optional("cloudpickle", label)
+    cloudpickle = import_cluster_package("cloudpickle", label)
     while True:
         pickler = make_class(cloudpickle.Pickler)(label, identifiers)
         pickler.fast = fast
@@ -263,7 +266,7 @@ def _by_value(definition: Any, reduce: Callable[[Any], Any]) -> Any:
     if module is None or not is_sent_itself(module):
         return reduce(definition)
     with _REGISTRY_LOCK:
-        cloudpickle = import_optional("cloudpickle", "to send code")
+        cloudpickle = import_cluster_package("cloudpickle", "to send code")
         # cloudpickle describes the contents of definitions in the modules on its list.
         was_listed = module.__name__ in cloudpickle.list_registry_pickle_by_value()
         cloudpickle.register_pickle_by_value(module)

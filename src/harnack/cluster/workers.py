@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import choose_backend, to_numpy
-from harnack.cluster.serialization import import_optional, package_versions
+from harnack.cluster.serialization import import_cluster_package, package_versions
 
 # How long to wait for a scheduler to answer.
 _CONNECT_TIMEOUT = "10s"
@@ -47,7 +47,7 @@ def connect_client(client: Any) -> Generator[Any]:
     if client is None:
         yield None
         return
-    distributed = import_optional("distributed", "client")
+    distributed = import_cluster_package("distributed", "client")
     own_client = None
     # A client that is opened here is closed here.
     if isinstance(client, str):
@@ -94,7 +94,7 @@ def exclusive_compute() -> Generator[str]:
     if worker is not None:
         adopt_worker_threads(worker.nanny is not None, worker.state.nthreads)
     # A lock of this name is the same one for all tasks of this process.
-    with import_optional("dask.utils", "client").SerializableLock("harnack"):
+    with import_cluster_package("dask.utils", "client").SerializableLock("harnack"):
         yield "" if worker is None else worker.address
 
 
@@ -170,6 +170,8 @@ def _worker_state(dask_worker: Any = None) -> tuple[str, str]:
 def adopt_worker_threads(has_nanny: bool, threads: int) -> None:
     """Set Dr.Jit's number of threads to the number `threads` that Dask gave this worker, if the
     process belongs to this worker alone.
+
+    A second call with the same arguments does nothing: users may have set another number since.
 
     has_nanny: whether Dask runs a supervising process (a nanny) for this worker; then the process
         belongs to it alone.

@@ -14,9 +14,9 @@ import numpy as np
 
 from harnack.backend.validation import no_derivatives
 from harnack.cluster.dask_arrays import is_dask_array
-from harnack.cluster.serialization import import_optional
+from harnack.cluster.serialization import import_cluster_package
 from harnack.cluster.workers import connect_client
-from harnack.progress import Advance, progress_bar
+from harnack.progress import ProgressFunction, show_progress
 
 # The attribute of a Zarr array that holds the name of the Dask array.
 _NAME_ATTRIBUTE = "harnack"
@@ -28,7 +28,7 @@ def to_zarr(
     path: str | os.PathLike[str],
     *,
     client: Any = None,
-    progress: bool | Advance = True,
+    progress: bool | ProgressFunction = True,
 ) -> Any:
     """Write a Dask array to a Zarr file, chunk by chunk, and return the Zarr array.
 
@@ -41,8 +41,7 @@ def to_zarr(
         path.
     client: a `dask.distributed.Client` or the address of a scheduler; by default the array is
         computed as Dask chooses.
-    progress: whether to show the progress; or a function that is called with each fraction of the
-        work that was finished (they add up to 1).
+    progress: whether to show the progress, or a function that is called with a `Progress`.
 
     Raises:
         ModuleNotFoundError: Dask or Zarr is not installed.
@@ -50,8 +49,8 @@ def to_zarr(
         ValueError: there is another array at the path, or the blocks have unequal lengths.
         OSError: the file cannot be written, or workers wrote to another file system.
     """
-    zarr = import_optional("zarr", "to_zarr")
-    dask = import_optional("dask", "to_zarr")
+    zarr = import_cluster_package("zarr", "to_zarr")
+    dask = import_cluster_package("dask", "to_zarr")
     if not is_dask_array(array):
         raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
     for lengths in array.chunks:
@@ -74,10 +73,13 @@ def to_zarr(
         write(str(target), _chunk_slices(array, index), blocks[index]) for index in missing_chunks
     ]
     fraction = 1 / max(1, array.npartitions)
-    with progress_bar("writing", progress) as advance, connect_client(client) as dask_client:
-        advance(1 - fraction * len(missing_chunks))
+    with (
+        show_progress("writing", progress) as reporter,
+        connect_client(client) as dask_client,
+    ):
+        reporter.advance(1 - fraction * len(missing_chunks))
         for _ in _compute_tasks(dask_client, tasks):
-            advance(fraction)
+            reporter.advance(fraction)
     for index in missing_chunks:
         if not _chunk_path(file, target, index).exists():
             raise OSError(
@@ -97,7 +99,7 @@ def _compute_tasks(client: Any, tasks: list[Any]) -> Iterator[None]:
         return
     futures = client.compute(tasks)
     try:
-        for future in import_optional("distributed", "client").as_completed(
+        for future in import_cluster_package("distributed", "client").as_completed(
             futures, loop=client.loop
         ):
             future.result()
@@ -155,7 +157,7 @@ def _chunk_slices(array: Any, index: tuple[int, ...]) -> tuple[slice, ...]:
 def _write_block(path: str, slices: tuple[slice, ...], block: Any) -> None:
     """Write a block of numbers into the Zarr array at `path`. It is run on a worker. slices: the
     place of the block in the array."""
-    zarr = import_optional("zarr", "to_zarr")
+    zarr = import_cluster_package("zarr", "to_zarr")
     # By default Zarr leaves out chunks of zeros, which would then be computed again.
     with zarr.config.set({"array.write_empty_chunks": True}):
         zarr.open_array(path, mode="r+")[slices] = block

@@ -339,7 +339,7 @@ class CellClassifier:
         self._volume = _domain(self.surface)
         self._has_hessian = has_hessian(self._backend, self._field)
         self._clip_descent = None
-        if self._volume is not None and not self.surface.field.has_jumps:
+        if self._volume is not None and self.surface.field.jumps is None:
             volume = self._volume.prepare(self._backend)
             self._clip_descent = ClipCurveDescent(self._backend, self._field, self._levels, volume)
 
@@ -475,7 +475,7 @@ class CellClassifier:
             & (linear_error < FAR_SENTINEL * gradient_norm)
         )
         # A slab holds the surface only if a single level, without jumps, passes through the ball.
-        if len(self._levels.values) > 1 or self.surface.field.has_jumps:
+        if len(self._levels.values) > 1 or self.surface.field.jumps is not None:
             is_slab &= False
         elif self._levels.period is not None:
             # f - level changes by at most |g| radius + error in the ball, so that no other level
@@ -504,7 +504,7 @@ class CellClassifier:
         and an upper bound of the curvature of the surface at the point.
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
-        if self.surface.field.has_jumps:
+        if self.surface.field.jumps is not None:
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
         point = self._newton_point(p, radius)
         is_found = point.x < 0.5 * FAR_SENTINEL
@@ -513,9 +513,9 @@ class CellClassifier:
         n = gradient / safe_norm(gradient)
         # A cell without a slab gets the tangent plane at its surface point.
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
-        plane_radius, boundary = radius + safe_norm(y - p), self._field.closest_boundary_point(y)
-        if boundary is not None:
-            plane_radius = fmin(plane_radius, safe_norm(boundary - y))
+        plane_radius, boundary = radius + safe_norm(y - p), self._field.boundary
+        if boundary is not None and boundary.closest_point is not None:
+            plane_radius = fmin(plane_radius, safe_norm(boundary.closest_point(y) - y))
         curvature = unknown
         if self._has_hessian:
             uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(y))

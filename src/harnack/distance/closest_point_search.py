@@ -17,7 +17,7 @@ subdivided if proofs are wanted.
 
 For a closed mesh, a tree finds the nearest triangle of the level set (`level_triangles`). If a mesh
 has holes, its surface also has parts off the triangles. There the winding number w has the level,
-and so does w modulo 1, which is smooth across the triangles (`JumpSurface.without_jumps`).
+and so does w modulo 1, which is smooth across the triangles (`Jumps.smooth_field`).
 Therefore the level set of w modulo 1 is searched, and a closest point of it is accepted only if w
 itself has the level there. (A search by rays toward ever nearer points was slower by a factor of
 18, and a tenth of its results were too far away.)
@@ -43,7 +43,7 @@ from harnack.distance.jump_surface_search import JumpSurfaceSearch, compass_sear
 from harnack.distance.level_triangles import LevelTriangles
 from harnack.distance.tangent_plane import first_order_distance, in_batches
 from harnack.fields.batch_evaluation import morton_order
-from harnack.fields.capabilities import NO_FACET
+from harnack.fields.capabilities import NO_FACET, exactly_sampled
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field
 from harnack.geometry.neighborhoods import kd_tree
@@ -153,12 +153,13 @@ def _find_sorted(
     x, guess, residual, lower, estimate = evaluator.evaluate(points)
     if triangles is not None:
         guess = _with_mesh_points(x, guess, triangles)
-    if surface.field.has_jumps:
+    if surface.field.jumps is not None:
         guess = evaluator.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
     batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
     # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
-    smooth = batch_field.without_jumps() if surface.clip_volume is None else None
+    jumps = batch_field.jumps
+    smooth = None if jumps is None or surface.clip_volume is not None else jumps.smooth_field()
     if smooth is None:
         result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
     else:
@@ -199,7 +200,7 @@ def _search_smooth_part(
 
     evaluator: evaluates f and runs descents.
     smooth: a function without jumps that differs from f by a constant between jump surfaces
-        (`JumpSurface.without_jumps`).
+        (`Jumps.smooth_field`).
     points: (n, 3) the query points.
     known: for each query, a point of the surface on a jump surface (NaN if none is known), and an
         estimate of the query's distance from the surface.
@@ -266,7 +267,10 @@ def _with_singular_points(
 
     points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
     """
-    singular = surface.field.singular_points
+    boundary = surface.field.boundary
+    if boundary is None or boundary.points is None:
+        return closest
+    singular = boundary.points
     if surface.clip_volume is not None and len(singular):
         singular = singular[surface.clip_volume.contains_points(singular)]
     if not len(singular) or not len(points):
@@ -344,13 +348,13 @@ class _QueryEvaluator:
         backend, field = self.backend, self.surface.evaluator(self.backend)
         assign = object.__setattr__
         assign(self, "_field", field)
-        exact = field.exact(backend)
+        exact = exactly_sampled(field, backend)
         assign(self, "_descent", ClosestPointDescent.of(backend, field, self.levels))
         assign(
             self,
             "_exact_descent",
             ClosestPointDescent.of(backend, exact, self.levels)
-            if field.has_variable_accuracy
+            if field.variable_accuracy is not None
             else None,
         )
         domain = field.domain and field.domain.prepare(backend)
@@ -358,7 +362,7 @@ class _QueryEvaluator:
         assign(self, "_clip", domain and ClipCurveDescent(backend, field, self.levels, domain))
         # Rays are compared by differences of angles, for which single precision is too coarse.
         double = choose_backend("double")
-        assign(self, "_tracer", self.surface.prepare(double) if field.has_jumps else None)
+        assign(self, "_tracer", self.surface.prepare(double) if field.jumps is not None else None)
 
     _field: Field = dataclasses.field(init=False)
     _descent: ClosestPointDescent = dataclasses.field(init=False)
@@ -385,8 +389,9 @@ class _QueryEvaluator:
             first-order estimate of that distance."""
             sample = self._field.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
-            boundary = self._field.closest_boundary_point(p)
-            surface_point = self.backend.Array3f(dr.nan) if boundary is None else boundary
+            boundary, surface_point = self._field.boundary, self.backend.Array3f(dr.nan)
+            if boundary is not None and boundary.closest_point is not None:
+                surface_point = boundary.closest_point(p)
             surface_point = dr.select(residual == 0, p, surface_point)
             lower = self.backend.Float(0)
             if sample.all_promises:
@@ -432,7 +437,8 @@ class _QueryEvaluator:
 
         points: (n, 3) the queries.
         """
-        mesh, surface = self.surface.field.jump_mesh(), self._tracer
+        jumps, surface = self._tracer.field.jumps, self._tracer
+        mesh = jumps.mesh()
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
             return closest
@@ -442,7 +448,7 @@ class _QueryEvaluator:
             """Return the point of a facet that is nearest to p, the index of the facet, and the
             facet's normal at the point."""
             no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
-            facet = surface.field.nearest_facet(p, no_key, real(dr.inf), always)
+            facet = jumps.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
 
         y, facet_id, normal = in_batches(surface.backend, nearest, points)
@@ -465,12 +471,12 @@ class _QueryEvaluator:
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
         """Return the distances (n,) of points (n, 3) from the facets across which f jumps, whether
         these are part of the surface or not."""
-        surface = self._tracer
+        jumps = self._tracer.field.jumps
 
         def compute(p: Vec3) -> tuple[Real]:
-            return (surface.field.distance_to_jumps(p),)
+            return (jumps.distance(p),)
 
-        return in_batches(surface.backend, compute, points)[0]
+        return in_batches(self._tracer.backend, compute, points)[0]
 
     def _search_facets(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Return the closest points (n, 3) that `JumpSurfaceSearch` finds on facets, nearer than
@@ -517,7 +523,7 @@ class _QueryEvaluator:
             this radius about the closest point, no point of the surface is nearer to the query; 0
             if that is not proved.
         """
-        if self.surface.field.has_jumps:
+        if self.surface.field.jumps is not None:
 
             def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)

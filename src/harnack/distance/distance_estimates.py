@@ -23,7 +23,7 @@ from harnack.enclosures import Levels
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field
 from harnack.name_suggestions import did_you_mean, is_one_of
-from harnack.progress import teller
+from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer import TracedSurface, TraceOptions
 from harnack.tracer.surface import intersection_of
 from harnack.tracer.trace_options import shows_keywords, surface_and_options
@@ -50,7 +50,7 @@ def signed_distance(
     points: Any,
     *,
     method: Method = "closest_point",
-    progress: Callable[[str], None] | None = None,
+    progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
@@ -81,7 +81,7 @@ def signed_distance(
             the nearer the surface, the smaller the relative error.
         For a field that jumps across facets, "first_order" and "second_order" see the smooth part
         of the surface, and the nearest facet if that is nearer and the surface lies there.
-    progress: a function that is called with a text about each stage.
+    progress: whether to show what is being done, or a function that is called with a `Progress`.
     options: a `TraceOptions`; distances use its `precision` alone. None is double precision.
         "lower_bound" allows for rounding in both precisions, and the search of "closest_point" is
         done in double precision in any case. Closest points have no tolerance: they are exact up to
@@ -116,9 +116,9 @@ def signed_distance(
     x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
-    if field.has_jumps and method != "lower_bound":
+    if field.jumps is not None and method != "lower_bound":
         # These methods do not see facets: the nearest one of the surface is searched for.
-        jump_distance = find_closest(backend, traced, levels, x, teller(None)).distance
+        jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
 
@@ -136,7 +136,7 @@ def closest_points(
     surface: Field | Surface,
     points: Any,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> FloatArray:
@@ -182,7 +182,7 @@ def distance_bounds(
     surface: Field | Surface,
     points: Any,
     *,
-    progress: Callable[[str], None] | None = None,
+    progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> DistanceBounds:
@@ -215,7 +215,7 @@ def _find(
     surface: TracedSurface,
     backend: Backend,
     points: Any,
-    progress: Callable[[str], None] | None,
+    progress: bool | ProgressFunction,
     *,
     is_proved: bool = False,
 ) -> ClosestPoints:
@@ -223,13 +223,13 @@ def _find(
     none. The surface's clip is made part of the field's domain first.
 
     name: the name of the public function, for messages.
-    progress: called with a message before each stage; None for none.
+    progress: as in `signed_distance`.
     is_proved: whether the lower bounds of the result are made as large as can be proved.
 
     Raises NotImplementedError for a clip or section of a field with jumps.
     """
     if surface.clip_volume is not None:
-        if surface.field.has_jumps:
+        if surface.field.jumps is not None:
             raise NotImplementedError(
                 f"{name} takes no clip and no section of a {type(surface.field).__name__}, which "
                 "jumps: cut its mesh by the volume, and give the winding number of that"
@@ -240,7 +240,8 @@ def _find(
         object.__setattr__(field, "domain", volume)  # also of frozen dataclasses
         surface = replace(surface, field=field, clip=None, section=None)
     levels = surface.target_levels(backend)
-    closest = find_closest(backend, surface, levels, points, teller(progress), is_proved=is_proved)
+    with show_progress(name, progress) as reporter:
+        closest = find_closest(backend, surface, levels, points, reporter.tell, is_proved=is_proved)
     _warn_of_failures(name, closest)
     return closest
 
@@ -263,10 +264,10 @@ def _surface(
     """
     target, choices = surface_and_options(verb, surface, options, keywords, _HONORED)
     field = target.field
-    if field.has_jumps and type(field).distance_to_jumps is Field.distance_to_jumps:
+    if field.jumps is not None and not field.jumps.gives_distances:
         raise NotImplementedError(
-            f"{type(field).__name__} has jumps but does not say how far they are: define its "
-            "method distance_to_jumps(p)"
+            f"{type(field).__name__} has jumps but does not say how far they are: define the "
+            f"method distance(p) of its {type(field.jumps).__name__}"
         )
     closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
     return TracedSurface.of(target, closely).with_call_cache(), choose_backend(

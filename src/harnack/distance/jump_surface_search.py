@@ -19,12 +19,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin, max_norm, orthonormal_basis
-from harnack.fields.capabilities import NO_FACET, JumpCrossing, NearestFacet
+from harnack.fields.capabilities import (
+    NO_FACET,
+    JumpCrossing,
+    NearestFacet,
+    exactly_sampled,
+)
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.field import Field
+    from harnack.fields.capabilities import Jumps
     from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
 
 __all__ = ["JumpSurfaceSearch", "compass_search", "is_on_surface", "straddles_level"]
@@ -168,14 +173,14 @@ class JumpSurfaceSearch:
         x) and the index of the facet before, as a pair; the largest distance from x; and the active
         lanes. It returns the next facet (`NearestFacet`), whose index is NO_FACET if there is none.
         """
-        field, backend = self.surface.field, self.surface.backend
+        jumps, backend = _jumps_of(self.surface), self.surface.backend
         real, index = backend.Float, backend.UInt32
         # Asked for no lane, only to learn whether the field can list its facets.
-        first_facet = field.nearest_facet(
+        first_facet = jumps.nearest_facet(
             x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False)
         )
         if first_facet is None:
-            facet = _nearest_jump_by_differences(backend, field, x)
+            facet = _nearest_jump_by_differences(backend, jumps, x)
 
             def single_facet(after: tuple[Real, Any], limit: Real, active: Mask) -> NearestFacet:
                 """Return the nearest facet if it is nearer to x than `limit` and the first number
@@ -194,9 +199,9 @@ class JumpSurfaceSearch:
             `after`, which is given by its sort key (a number that grows with the distance) and its
             index. The result is the placeholder for no facet if the next one is farther from x than
             `limit`, and on lanes that are not active."""
-            nearest = field.nearest_facet(x, after, limit, active)
+            nearest = jumps.nearest_facet(x, after, limit, active)
             if nearest is None:
-                raise RuntimeError("nearest_sheet tells sheets at some times and not at others")
+                raise RuntimeError("nearest_facet gives facets at some times and not at others")
             return nearest
 
         return listed_facet
@@ -213,7 +218,8 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     surface crosses the path between them: f passes the level there, continuously or by a jump. No
     gradient is used, because it is unbounded near the edge of a jump surface.
     """
-    backend, field = surface.backend, surface.field.exact(surface.backend)
+    backend, jumps = surface.backend, _jumps_of(surface)
+    field = exactly_sampled(surface.field, backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     zero = vector(0)
 
@@ -227,7 +233,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
         direction, edge_length = (end - start) / edge_norm, radius * edge_norm
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
         # Up to the first facet on the edge; the two values are taken on the same side of it.
-        t = real(field.next_jump(o, direction, start_crossing, edge_length, active).t)
+        t = real(jumps.next_crossing(o, direction, start_crossing, edge_length, active).t)
         before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
         for distance in (real(0), _FRACTION_TO_FACET * before_jump):
             value = real(field.evaluate(dr.fma(vector(distance), direction, o)).value)
@@ -241,6 +247,17 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     _, lower, upper, _ = dr.while_loop(start, is_active, body, label="sides of a level")
     # The next level above the smallest value is below the largest value.
     return (lower < upper) & (surface.levels.gaps(lower).above < upper - lower)
+
+
+def _jumps_of(surface: SurfaceTracer) -> Jumps:
+    """Return the facets at which the surface's function f jumps.
+
+    Raises:
+        TypeError: f does not jump.
+    """
+    if surface.field.jumps is None:
+        raise TypeError(f"a {type(surface.field).__name__} does not jump")
+    return surface.field.jumps
 
 
 def _parts(facet: NearestFacet) -> tuple[Any, ...]:
@@ -268,8 +285,8 @@ def _probe(vector: Any, index: Any, normal: Vec3) -> tuple[Vec3, Vec3]:
     return start, end
 
 
-def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> NearestFacet:
-    """Return the facet nearest to x, for a field that knows only the distance d(x) from its nearest
+def _nearest_jump_by_differences(backend: Backend, jumps: Jumps, x: Vec3) -> NearestFacet:
+    """Return the facet nearest to x, for jumps that know only the distance d(x) from its nearest
     facet. The facet lies at the distance d in the direction in which d falls fastest.
 
     That direction is computed by central differences of d over the length h = r d, with a ratio r.
@@ -279,13 +296,13 @@ def _nearest_jump_by_differences(backend: Backend, field: Field, x: Vec3) -> Nea
     x itself is on the facet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
-    d = real(field.distance_to_jumps(x))
+    d = real(jumps.distance(x))
     size = fmax(dr.max(dr.abs(x)), d)
     h = d * fmin(dr.cbrt(backend.machine_epsilon * size / d), 0.5)
     differences: list[Real] = []
     for axis in range(3):
         shift = vector(*(h if k == axis else 0 for k in range(3)))
-        ahead, behind = (field.distance_to_jumps(q) for q in (x + shift, x - shift))
+        ahead, behind = (jumps.distance(q) for q in (x + shift, x - shift))
         differences.append(behind - ahead)
     descent = vector(*differences)
     gradient_norm = dr.norm(descent)

@@ -71,11 +71,17 @@ class LevelTriangles:
                 return None
             solid = surface.field.surface
             return cls(solid.corners, solid.center, solid.size, True)
-        mesh = surface.field.jump_mesh()
-        if mesh is None or surface.clip_volume is not None or surface.field.domain is not None:
+        jumps = surface.field.jumps
+        mesh = None if jumps is None else jumps.mesh()
+        if (
+            jumps is None
+            or mesh is None
+            or surface.clip_volume is not None
+            or surface.field.domain is not None
+        ):
             return None
         vertices, faces, is_integer_off_faces = mesh
-        is_jumps_only = surface.field.is_of_sheets_alone(surface.level_values)
+        is_jumps_only = jumps.are_whole_surface(surface.level_values)
         # The scale is a power of two and the center has single precision: so scaling is exact.
         lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
         size = float(2.0 ** np.ceil(np.log2(0.5 * (upper - lower).max())))

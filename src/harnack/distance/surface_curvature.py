@@ -119,14 +119,18 @@ def curvature(
                 the error.
             """
             refined = (
-                prepared.at_accuracy(acceptance) if prepared.has_variable_accuracy else prepared
+                prepared
+                if prepared.variable_accuracy is None
+                else prepared.variable_accuracy.at(acceptance)
             )
             sample = refined.evaluate(p)
             errors = refined.derivative_errors(p, sample)
             rows = refined.hessian(p)
             return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
-        return _refine_accuracy(backend, field, from_field, points, prepared.has_variable_accuracy)
+        return _refine_accuracy(
+            backend, field, from_field, points, prepared.variable_accuracy is not None
+        )
 
     def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
         """Return the curvatures at p, from the tree sums of a field that is evaluated in batches

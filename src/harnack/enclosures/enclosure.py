@@ -13,17 +13,17 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from typing import Self
 
-    from harnack.backend import Mask, Real, Vec3
+    from harnack.backend import Mask, Real
     from harnack.enclosures.promises import Promise
 
 
@@ -59,21 +59,6 @@ class PathRestriction(Protocol):
         each knot and the next, where t is the start of the path.
 
         knots: increasing lengths s, the first of them 0.
-        """
-        ...
-
-
-@runtime_checkable
-class EvaluableRestriction(Protocol):
-    """A function along a path (a ray) that is given by a formula in x, y and z. It can be evaluated
-    in any arithmetic, such as that of intervals."""
-
-    def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """Return the value of the formula at (x, y, z) = coordinates(p, d), in the arithmetic of
-        these coordinates.
-
-        coordinates: a function of the start p and the direction d of the path. It returns the three
-            coordinates along the path as numbers of some arithmetic, such as jets or intervals.
         """
         ...
 

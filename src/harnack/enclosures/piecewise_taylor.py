@@ -6,7 +6,6 @@ the start.
 
 from __future__ import annotations
 
-import abc
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -60,14 +59,9 @@ class PiecewiseTaylorEnclosure(Enclosure):
         The first two pieces are equally long; each of the others is twice as long as the one before
         it.
         """
-        count = cls._piece_count(function)
+        count = function.piece_count
         knots = [length * 2.0 ** (k + 1 - count) for k in range(count)]
         return cls(slopes, function.derivative_ranges([0.0, *knots]))
-
-    @classmethod
-    def _piece_count(cls, function: PathRestriction) -> int:
-        """Return the number of pieces into which the path is divided."""
-        return function.piece_count
 
     @property
     def reach_growth(self) -> float:
@@ -165,71 +159,3 @@ class PiecewiseTaylorEnclosure(Enclosure):
         rise = fmin(by_parabola, max_slope * length + epsilon * dr.abs(max_slope * length))
         slope = dr.fma(curvature, length, slope)
         return dr.fma(0.25 * epsilon, dr.abs(slope), slope), reach, gap - rise
-
-
-class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
-    """Base of the enclosures of the literature that use ranges of the derivatives of f on the whole
-    length of a path, as one piece."""
-
-    @classmethod
-    def _piece_count(cls, function: PathRestriction) -> int:
-        """Return 1."""
-        del function
-        return 1
-
-
-class QuadraticTaylorEnclosure(SinglePieceEnclosure):
-    """The parabola that bounds f along a path, from the slope at the start and the range of F'' (F
-    is the change of f).
-
-    Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `PiecewiseTaylorEnclosure`,
-        without the line.
-    """
-
-    @classmethod
-    def _advance_piece(
-        cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
-    ) -> tuple[Real, Real, Real]:
-        """Advance the parabola over the piece, as the base class does it for the parabola and a
-        line; the largest slope on the piece is not used."""
-        del max_slope
-        return super()._advance_piece(gap, slope, type(gap)(dr.inf), curvature, length)
-
-
-class LinearTaylorEnclosure(SinglePieceEnclosure):
-    """The line that bounds f along a path, from the range of F' on the whole length (F is the
-    change of f).
-
-    Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
-        `PiecewiseTaylorEnclosure`, without the parabola.
-    """
-
-    @classmethod
-    def _advance_piece(
-        cls, gap: Real, slope: Real, max_slope: Real, curvature: Real, length: Real
-    ) -> tuple[Real, Real, Real]:
-        """Advance the line over the piece, as the base class does it for a parabola and the line;
-        the slope at the start and the second derivative are not used."""
-        del slope, curvature
-        return super()._advance_piece(gap, max_slope, max_slope, type(gap)(0), length)
-
-
-class SegmentTracingEnclosure(SinglePieceEnclosure):
-    """The cone |F(s)| <= K s, where F is the change of f along a path and K bounds |F'| on its
-    length: segment tracing.
-
-    Source: Galin, Guerin, Paris and Peytavie 2020; Aydinlilar and Zanni 2023, equation 10.
-    """
-
-    @classmethod
-    def from_restriction(
-        cls, function: PathRestriction, slopes: SlopeRange, length: Real
-    ) -> Self | None:
-        """Return the enclosure from the largest |F'| on the whole length. The result is never None.
-
-        function: f along the path. slopes: the range of its derivative at the start; not used.
-        """
-        (piece,) = function.derivative_ranges([0.0, length])
-        max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
-        interval = SlopeRange(-max_slope, max_slope)
-        return cls(interval, (PathPiece(piece.length, interval, 0.0, 0.0),))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from harnack.backend.elementary import fmax
@@ -19,20 +20,8 @@ from harnack.enclosures.harmonic_ball import (
     HarnackSlopeEnclosure,
     SphericalCapEnclosure,
 )
-from harnack.enclosures.literature import (
-    AffineEnclosure,
-    BottomUpLinearEnclosure,
-    BottomUpQuadraticEnclosure,
-    IntervalEnclosure,
-    LongestOfEnclosure,
-)
 from harnack.enclosures.parabola import ConvexityEnclosure, LipschitzEnclosure, TaylorEnclosure
-from harnack.enclosures.piecewise_taylor import (
-    LinearTaylorEnclosure,
-    PiecewiseTaylorEnclosure,
-    QuadraticTaylorEnclosure,
-    SegmentTracingEnclosure,
-)
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.promises import Promise
 from harnack.name_suggestions import did_you_mean
 
@@ -48,14 +37,6 @@ _SLOPE = (HarnackSlopeEnclosure, BoundedLaplacianEnclosure, *_FALLBACK)
 _CURVATURE = (TaylorEnclosure, SphericalCapEnclosure, *_SLOPE)
 _KINDS_BY_NAME: dict[str, tuple[type[Enclosure], ...]] = {
     "pieces": (PiecewiseTaylorEnclosure, ConvexityEnclosure, *_CURVATURE),
-    "quadratic-taylor": (QuadraticTaylorEnclosure,),
-    "linear-taylor": (LinearTaylorEnclosure,),
-    "segment": (SegmentTracingEnclosure,),
-    "bottom-up-linear": (BottomUpLinearEnclosure,),
-    "bottom-up-quadratic": (BottomUpQuadraticEnclosure,),
-    "mixed": (LongestOfEnclosure,),
-    "affine": (AffineEnclosure,),
-    "interval": (IntervalEnclosure,),
     "curvature": _CURVATURE,
     "caps": (SphericalCapEnclosure, *_SLOPE),
     "slope": _SLOPE,
@@ -63,12 +44,21 @@ _KINDS_BY_NAME: dict[str, tuple[type[Enclosure], ...]] = {
     "laplacian": (BoundedLaplacianEnclosure, *_FALLBACK),
     "lipschitz": _FALLBACK,
 }
-ENCLOSURE_NAMES = tuple(sorted(_KINDS_BY_NAME))
+# Methods of the literature, for comparison: a name, and the class in `harnack.literature`. That
+# package is imported when such a name is asked for, and by nothing else.
+_LITERATURE_CLASSES = {
+    "quadratic-taylor": "QuadraticTaylorEnclosure",
+    "linear-taylor": "LinearTaylorEnclosure",
+    "segment": "SegmentTracingEnclosure",
+    "bottom-up-linear": "BottomUpLinearEnclosure",
+    "bottom-up-quadratic": "BottomUpQuadraticEnclosure",
+    "mixed": "LongestOfEnclosure",
+    "affine": "AffineEnclosure",
+    "interval": "IntervalEnclosure",
+}
+ENCLOSURE_NAMES = tuple(sorted((*_KINDS_BY_NAME, *_LITERATURE_CLASSES)))
 # Names of enclosures that need no promise: they are derived from ranges of a formula.
-_NAMES_USING_RANGES = [
-    f'"{name}"' for name, (sharpest, *_) in _KINDS_BY_NAME.items()
-    if sharpest.from_restriction.__func__ is not Enclosure.from_restriction.__func__
-]  # fmt: skip
+_NAMES_USING_RANGES = [f'"{name}"' for name in ("pieces", *_LITERATURE_CLASSES)]
 
 
 @dataclass(frozen=True)
@@ -234,13 +224,7 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
     if enclosures is None:
         return EnclosureKinds(_KINDS_BY_NAME["pieces"], uses_alternative_promises=False)
     if isinstance(enclosures, str):
-        if enclosures not in _KINDS_BY_NAME:
-            names = ", ".join(sorted(_KINDS_BY_NAME))
-            raise ValueError(
-                f"unknown enclosures {enclosures!r}; choose one of {names}"
-                f"{did_you_mean(enclosures, _KINDS_BY_NAME)}"
-            )
-        return EnclosureKinds(_KINDS_BY_NAME[enclosures])
+        return EnclosureKinds(_kinds_of_name(enclosures))
     # A single class, or several.
     classes = cast("Any", enclosures) if isinstance(enclosures, Iterable) else (enclosures,)
     kinds: tuple[Any, ...] = tuple(classes)
@@ -251,6 +235,18 @@ def choose_enclosures(enclosures: EnclosureChoice = None) -> EnclosureKinds:
             f"harnack.proofs.LipschitzEnclosure), not {enclosures!r}"
         )
     return EnclosureKinds(kinds)
+
+
+def _kinds_of_name(name: str) -> tuple[type[Enclosure], ...]:
+    """Return the classes of enclosures for a name. Raises ValueError if there is no such name."""
+    if name in _LITERATURE_CLASSES:
+        return (getattr(import_module("harnack.literature"), _LITERATURE_CLASSES[name]),)
+    if name not in _KINDS_BY_NAME:
+        raise ValueError(
+            f"unknown enclosures {name!r}; choose one of {', '.join(ENCLOSURE_NAMES)}"
+            f"{did_you_mean(name, ENCLOSURE_NAMES)}"
+        )
+    return _KINDS_BY_NAME[name]
 
 
 def _is_proof(kind: Any) -> bool:

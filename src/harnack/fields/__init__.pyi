@@ -11,7 +11,17 @@ from .analytic.riemann_surface import RiemannSurface
 from .analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
 from .blobs.blobs import Blobs, Molecule
 from .blobs.hrbf import HRBF
-from .capabilities import NO_FACET, JumpCrossing
+from .capabilities import (
+    NO_FACET,
+    NO_PATCH,
+    Boundary,
+    JumpCrossing,
+    Jumps,
+    NearestFacet,
+    PatchEntry,
+    Patches,
+    VariableAccuracy,
+)
 from .expressions import expression
 from .field import Field, Sample
 from .formula import Formula
@@ -26,7 +36,9 @@ from .solids.solid import FormulaSolid, Solid
 __all__ = [
     "HRBF",
     "NO_FACET",
+    "NO_PATCH",
     "Blobs",
+    "Boundary",
     "BranchPoint",
     "DipolePotential",
     "EigenfunctionSum",
@@ -39,10 +51,14 @@ __all__ = [
     "HeightField",
     "HypersphericalHarmonic",
     "JumpCrossing",
+    "Jumps",
     "LevelCurves",
     "Lobes",
     "Molecule",
     "Morph",
+    "NearestFacet",
+    "PatchEntry",
+    "Patches",
     "PlaneWave",
     "PolygonMesh",
     "RiemannSurface",
@@ -53,6 +69,7 @@ __all__ = [
     "Solid",
     "SolidAngle",
     "SphericalHarmonic",
+    "VariableAccuracy",
     "WaveProduct",
     "WindingNumber",
     "cosine_factor",

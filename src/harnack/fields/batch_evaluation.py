@@ -85,7 +85,9 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
         precision: for NumPy points, "single" or "double"; None for that of the points.
         """
         if dr.is_array_v(type(p)):
-            check_no_derivatives(f"the Hessian of {type(self).__name__}", p, self.parameters())
+            check_no_derivatives(
+                f"the Hessian of {type(self).__name__}", p, self.differentiable_parameters()
+            )
             return hessian(self, p)
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:

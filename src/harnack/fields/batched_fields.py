@@ -303,7 +303,7 @@ class BatchedField(Field):
 
 class SumAtDetail(EvaluateOnly):
     """A sum over sources, sampled at one accuracy scale (larger is more accurate; the parameter of
-    `VariableAccuracy.at_accuracy`), with second derivatives. It is made of two functions of a point
+    `VariableAccuracy.at`), with second derivatives. It is made of two functions of a point
     p, a Dr.Jit 3-vector.
 
     evaluate: returns the sample at p: value, gradient and proved bounds of f near p.
@@ -441,7 +441,7 @@ def cached_prepare(prepare: Prepare) -> Prepare:
     @functools.wraps(prepare)
     def cached(self: Field, backend: Backend) -> Field:
         """The prepared field: the cached one, unless the field has parameters."""
-        if self.parameters():
+        if self.differentiable_parameters():
             return prepare(self, backend)
         return caches[backend].get(self, None, lambda: prepare(self, backend))
 

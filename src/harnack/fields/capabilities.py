@@ -1,18 +1,20 @@
-"""Optional capabilities of a field, as base classes of `Field`. A field is a function f of space;
-its surface is a level set of f; a sample of it at a point is its value and gradient there, with
-proved bounds of f near the point ("promises"). Each class here has defaults for fields that lack
-the capability:
+"""Optional capabilities of a field. A field is a function f of space; its surface is a level set of
+f; a sample of it at a point is its value and gradient there, with proved bounds of f near the point
+("promises"). Each capability is an object, an attribute of the field, which is None for a field
+that lacks it:
 
-- `JumpSurface`: f jumps across a surface made of facets, such as the triangles of a mesh.
-- `PatchUnion`: the surface is the union of many level sets (patches), each of its own function and
-  inside its own box.
-- `CommonBoundary`: every level set ends at the same curves.
-- `VariableAccuracy`: f can be sampled with different accuracy.
+- `Field.jumps`, a `Jumps`: f jumps across a surface made of facets, such as the triangles of a
+  mesh.
+- `Field.modulo_one`, a `ModuloOne`: f can be sampled up to an unknown integer in less time.
+- `Field.patches`, a `Patches`: the surface is the union of many level sets (patches), each of its
+  own function and inside its own box.
+- `Field.boundary`, a `Boundary`: every level set ends at the same curves or points.
+- `Field.accuracy`, an `VariableAccuracy`: f can be sampled with different accuracy.
 
 Accuracy of sums over trees. The smaller the truncation error of a sum over a tree, the higher its
-cost; and far from the surface a large error does no harm. So `VariableAccuracy.at_accuracy` takes
-any accuracy, from coarse to a direct sum. If the truncation error decides about a step or a hit,
-the tracer samples the point again with higher accuracy, until a hit is within the tolerance minus
+cost; and far from the surface a large error does no harm. So `VariableAccuracy.at` takes any
+scale, from coarse to a direct sum. If the truncation error decides about a step or a hit, the
+tracer samples the point again with higher accuracy, until a hit is within the tolerance minus
 the truncation error. What rounding alone leaves uncertain about the position of a hit is reported
 in `Hits.uncertainty`. If it is large, for example because grad f is 0 on the surface, `trace`
 searches for the surface around the hit after the march (`doubtful`). The samples of such sums
@@ -22,12 +24,11 @@ length about five times as long as the ranges of f in the published proof.
 
 from __future__ import annotations
 
-import copy
+import abc
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
@@ -57,7 +58,7 @@ class JumpCrossing:
 
 @dataclass(frozen=True)
 class NearestFacet:
-    """The facet nearest to a point x, among the facets that a query allows (`Field.nearest_facet`).
+    """The facet nearest to a point x, among the facets that a query allows (`Jumps.nearest_facet`).
     Facets are the pieces of the surface across which f jumps.
 
     sort_key: a number that grows with the distance from x; inf if there is no facet. Facets are
@@ -96,76 +97,29 @@ class PatchEntry:
     patch: Any
 
 
-class JumpSurface:
-    """A field whose function f jumps across a surface made of facets, such as triangles. The facets
-    cut a ray o + t d, with |d| = 1, into intervals. On each interval f is smooth, and can be
-    continued smoothly beyond both ends of the interval; this continuation is what the tracer
-    marches along. A crossing is a point where the ray meets a facet (`JumpCrossing`). The defaults
-    describe a field without facets.
+class Jumps(abc.ABC):
+    """The facets, such as triangles, across which the function f of a field jumps. They cut a ray o
+    + t d, with |d| = 1, into intervals. On each interval f is smooth, and can be continued smoothly
+    beyond both ends of the interval; this continuation is what the tracer marches along. A crossing
+    is a point where the ray meets a facet (`JumpCrossing`).
 
-    The promises of a sample (proved bounds of f near a point) are about the continued function.
-    Where a ray crosses a facet, the values just before and just behind it are compared with the
-    levels.
+    The promises of a sample (proved bounds of f near a point) are about f continued smoothly
+    through all facets. Where a ray crosses a facet, the values just before and just behind it are
+    compared with the levels.
 
-    A field with jumps is real-valued (no period), has `has_jumps = True`, and defines two methods:
-    `next_jump` gives the next crossing of a ray, and `continuation` gives the field on the interval
-    between two crossings. Fields that count jumps also define `initial_offset`.
+    A field with jumps is real-valued (it has no period). Subclasses define two methods:
+    `next_crossing` gives the next crossing of a ray, and `continuation` gives the field on the
+    interval between two crossings. Fields that count jumps also define `initial_offset`.
 
-    All methods may be called while a loop is being recorded. Results on lanes that are not active
+    These methods may be called while a loop is being recorded. Results on lanes that are not active
     are ignored.
     """
 
-    has_jumps: bool = False
-    """Whether f jumps across facets. Then `next_jump` and `continuation` are needed, and the
-    promises of `evaluate` are about f continued smoothly through all facets."""
+    takes_all_levels: bool = False
+    """Whether the field takes its levels only at its facets: see `are_whole_surface`."""
 
-    @property
-    def has_unknown_branch(self) -> bool:
-        """Whether samples of `continuation` may give f only modulo 1, at an accuracy scale below
-        `coarsest_accuracy`.
-
-        If so, those samples set `Sample.branch_unknown`, and all jumps of f are integers. Besides,
-        `extent` has to fulfill a condition. Take a set of levels that contains, with each level L,
-        also that one of the numbers L + k, k an integer, which is nearest to 0. Then at points
-        outside of the extent of this set no number L + k lies between 0 and f.
-        """
-        return False
-
-    def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
-        """Whether the level set of these levels consists of all facets (the sheets of the surface
-        across which f jumps) and of nothing else. Then `with_levels` returns a field that takes the
-        levels at every facet and nowhere else. The default is False."""
-        del levels
-        return False
-
-    only_sheets: bool = False
-    """Whether this field takes its levels only where it jumps, at its facets (sheets): see
-    `is_of_sheets_alone`."""
-
-    def without_jumps(self) -> Field | None:
-        """A field without jumps whose level sets contain all points of this field's level sets,
-        except those on facets; None, the default, if no such field is known. Computations of
-        distances use it."""
-        return None
-
-    def evaluate_modulo_one(self, p: Vec3) -> Sample:
-        """A sample at p whose value is f minus an unknown integer, which may differ from point to
-        point. So it may take less time than `evaluate`. It is used only for fields with
-        `has_unknown_branch`. The default is `evaluate`."""
-        return cast("Field", self).evaluate(p)
-
-    def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p, if there is a way to compute it that takes less time than `evaluate`. The result
-        is NaN on lanes where there is none, on lanes that are not active, and where p may lie on a
-        facet. It is used only for fields with `has_unknown_branch`. The default is NaN everywhere.
-
-        rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p
-            lies.
-        """
-        del rounding, active
-        return 0 * p.x + math.nan
-
-    def next_jump(
+    @abc.abstractmethod
+    def next_crossing(
         self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
     ) -> JumpCrossing:
         """The first crossing of the ray o + t d with a facet strictly after the crossing `after`,
@@ -181,8 +135,6 @@ class JumpSurface:
         after: the crossing after which the search begins.
         t_max: the largest t.
         """
-        del o, d, after, t_max, active
-        return JumpCrossing(float("inf"), NO_FACET, 0.0, (0.0, 0.0, 0.0))
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         """A number that describes f at the start of a ray o + t d, on active lanes. The field
@@ -191,11 +143,12 @@ class JumpSurface:
         `continuation`.
 
         t_min: the parameter of the start. Crossings with t <= t_min lie behind the start
-            (`next_jump` after (t_min, NO_FACET)); all others lie in front of it.
+            (`next_crossing` after (t_min, NO_FACET)); all others lie in front of it.
         """
         del o, d, t_min, active
         return 0.0
 
+    @abc.abstractmethod
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
     ) -> Field:
@@ -212,14 +165,18 @@ class JumpSurface:
         near p) are about the continued function. The tracer uses them only between the two
         crossings.
         """
-        del o, d, behind, ahead, offset
-        return cast("Field", self)
 
-    def distance_to_jumps(self, p: Vec3) -> Real:
-        """The distance from p to the nearest facet, rounded down; inf, the default, if there are no
-        facets. Lower bounds of distances use it."""
-        del p
-        return float("inf")
+    def distance(self, p: Vec3) -> Real:
+        """The distance from p to the nearest facet, rounded down. Lower bounds of distances use it;
+        for fields that do not define it they are refused."""
+        raise NotImplementedError(
+            f"{type(self).__name__} gives no distances to facets: define its method distance(p)"
+        )
+
+    @property
+    def gives_distances(self) -> bool:
+        """Whether the class defines `distance`."""
+        return type(self).distance is not Jumps.distance
 
     def nearest_facet(
         self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
@@ -232,51 +189,84 @@ class JumpSurface:
         limit: a length.
 
         Facets are ordered by `NearestFacet.sort_key`, then by index. Repeated calls must give each
-        facet once. A field that cannot list its facets returns None, as the default does:
-        computations of distances then search for the nearest facet only, by descent of
-        `distance_to_jumps`.
+        facet once. The default is None: computations of distances then search for the nearest facet
+        only, by descent of `distance`.
         """
         del p, after, limit, active
         return None
 
-    def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """The mesh of the facets, for a field that is the winding number of a mesh; None for other
-        fields. Computations of distances use it.
+    def mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """The mesh of the facets, for a field that is the winding number of a mesh; None, the
+        default, for other fields. Computations of distances use it.
 
         Returns the vertices (n, 3); the faces (m, 3), each repeated by its multiplicity; and
         whether f is an integer everywhere off the faces.
         """
         return None
 
+    def smooth_field(self) -> Field | None:
+        """A field without jumps whose level sets contain all points of this field's level sets,
+        except those on facets; None, the default, if no such field is known. Computations of
+        distances use it."""
+        return None
 
-class PatchUnion:
-    """A surface that is the union of many level sets, called patches. Each patch is a level set of
-    a function of its own, and lies in a box of its own. In a polygon mesh, for example, each face
-    is a level set of the solid angle of its boundary, and no single function describes all faces.
-    Rays are o + t d with |d| = 1. The defaults describe a field without patches.
+    def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
+        """Whether the level set of these levels consists of all facets and of nothing else. Then
+        `Field.with_levels` returns a field that takes the levels at every facet and nowhere else
+        (`takes_all_levels`). The default is False."""
+        del levels
+        return False
+
+
+class ModuloOne(abc.ABC):
+    """Samples that give f only up to an integer, for a field whose jumps are all integers.
+
+    Samples of `Jumps.continuation` may then give f only modulo 1
+    (`VariableAccuracy.may_lack_integer`). Besides, `Field.extent` has to fulfill a condition. Take
+    a set of levels that contains, with each level L, also that one of the numbers L + k, k an
+    integer, which is nearest to 0. Then at points outside of the extent of this set no number L + k
+    lies between 0 and f.
+    """
+
+    @property
+    @abc.abstractmethod
+    def sure_accuracy(self) -> float:
+        """The smallest accuracy scale at which samples of `Jumps.continuation` give f itself, in
+        (0, 1]."""
+
+    @abc.abstractmethod
+    def evaluate(self, p: Vec3) -> Sample:
+        """A sample at p whose value is f minus an unknown integer, which may differ from point to
+        point. So it may take less time than `Field.evaluate`."""
+
+    def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
+        """f at p, on active lanes on which it takes less time than `Field.evaluate`. The result is
+        NaN on all other lanes, and where p may lie on a facet. The default is NaN everywhere.
+
+        rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p
+            lies.
+        """
+        del rounding, active
+        return 0 * p.x + math.nan
+
+
+class Patches(abc.ABC):
+    """The patches of a surface that is the union of many level sets. Each patch is a level set of a
+    function of its own, and lies in a box of its own. In a polygon mesh, for example, each face is
+    a level set of the solid angle of its boundary, and no single function describes all faces. Rays
+    are o + t d with |d| = 1.
 
     The first hit of a ray is the first of its hits with all patches. So the tracer marches along
     the patches whose boxes the ray enters, in the order in which it enters them, and no farther
     than the first hit so far.
 
-    A field with patches has `has_patches = True` and defines two methods. `next_patch` gives the
-    next patch along a ray. `patch` gives the function of a patch, as a field. The patches share the
-    period, the levels and the domain of the field. The field's own `evaluate` has no meaning.
-
-    `with_levels` is called first. The other methods may be called while a loop is being recorded.
+    The patches share the period, the levels and the domain of the field, whose own `evaluate` has
+    no meaning. `Field.with_levels` is called first. The methods may be called while a loop is being
+    recorded.
     """
 
-    has_patches: bool = False
-    """Whether the surface is a union of patches, each of its own field. Then `next_patch` and
-    `patch` are needed."""
-
-    def with_levels(self, levels: tuple[float, ...]) -> Field:
-        """This field with boxes that contain the patches of these levels, not yet prepared for a
-        backend. The default is the field itself."""
-        del levels
-        return cast("Field", self)
-
-    def next_patch(
+    @abc.abstractmethod
+    def next_entry(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
         """The first box that a ray o + t d enters after the entry `after`, with start <= t <= end,
@@ -287,9 +277,8 @@ class PatchUnion:
         ray meets between `start` and `end` once, in this order. If there is no further box, patch =
         NO_PATCH.
         """
-        del o, d, after, start, end, active
-        return PatchEntry(float("inf"), float("inf"), NO_PATCH)
 
+    @abc.abstractmethod
     def patch(self, index: Any) -> Field:
         """The field that has the patch with this index as one of its level sets.
 
@@ -298,89 +287,66 @@ class PatchUnion:
         Its `evaluate` and `sample_ray` may be called at points of any size, and its promises
         (proved bounds near a point) hold in all of space.
         """
-        del index
-        return cast("Field", self)
 
 
-class CommonBoundary:
-    """A field whose level sets all end at the same curves, or all come arbitrarily near to the same
-    points. For example, every level set of an angle around a curve ends at the curve. The defaults
-    describe a field without such curves and points."""
+@dataclass(frozen=True)
+class Boundary:
+    """The curves at which all level sets of a field end, and the points to which all of them come
+    arbitrarily near. For example, every level set of an angle around a curve ends at the curve.
+    Curves at which `Field.domain` cuts level sets off do not count.
 
-    @property
-    def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """The closed curves at which all level sets end, each as an array (n, 3) of points; the
-        first point is not repeated at the end."""
-        return ()
-
-    def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
-        """The point closest to p on the curves at which all level sets end; None if there are no
-        such curves.
-
-        It is called only for distances, and while no loop is being recorded. Curves at which
-        `domain` cuts level sets off do not count.
-        """
-        del p
-        return None
-
-    @property
-    def singular_points(self) -> FloatArray:
-        """Points (n, 3) to which all level sets come arbitrarily near, such as the dipoles of a
-        cloud. Computations of distances use them."""
-        return np.zeros((0, 3))
-
-    def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
-        """The change (n,) of an angle-valued f along the straight segments from p to q, where f is
-        followed continuously, without jumps by its period. None, the default, if only values modulo
-        the period are known. Meshing uses it on long edges.
-
-        p, q: (n, 3).
-        """
-        del p, q
-        return None
-
-
-# An accuracy scale that is so large that there is no truncation.
-EXACT = 1e9
-
-
-class VariableAccuracy:
-    """A field that can be sampled with different accuracy, such as a sum over a tree of sources,
-    which treats a far cluster of sources as a single source. The farther a cluster must be for
-    that, the smaller is the truncation error and the higher the cost. The defaults describe a field
-    with a single accuracy.
-
-    The tracer starts with coarse samples and refines them where the truncation error shortens
-    steps.
+    curves: the closed curves, each as an array (n, 3) of points; the first point is not repeated at
+        the end.
+    points: (n, 3) the points, such as the dipoles of a cloud. Computations of distances use them.
+    closest_point: a function that returns the point of the curves closest to a point p (Dr.Jit
+        3-vectors). It is called only for distances, and while no loop is being recorded. None if
+        there are no curves.
+    continuous_change: a function that returns the change (n,) of an angle-valued f along the
+        straight segments from points p (n, 3) to q (n, 3), if f is followed continuously, so
+        without jumps by its period. Meshing uses it on long edges. None if only values modulo the
+        period are known.
     """
 
-    has_variable_accuracy: bool = False
-    """Whether f can be sampled with different accuracy; then `at_accuracy` is needed."""
+    curves: tuple[FloatArray, ...] = ()
+    points: FloatArray | None = None
+    closest_point: Callable[[Vec3], Vec3] | None = None
+    continuous_change: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
-    coarsest_accuracy: float = 1.0
-    """The accuracy scale of the coarsest samples, in (0, 1]; larger is more accurate. A smaller
-    scale, such as 0, gives no coarser samples. (Only a field with `has_unknown_branch` may then
-    give f modulo 1.) See `at_accuracy`."""
 
-    def at_accuracy(self, detail: Real) -> Field:
-        """This field, sampled with another accuracy.
+EXACT = 1e9
+"""An accuracy scale that is so large that there is no truncation."""
 
-        detail: the accuracy scale, which may differ from lane to lane. Larger is more accurate: 0
-            gives the coarsest samples of the field, 1 the samples of `evaluate`, and a number above
-            1 more accurate samples.
 
-        `Sample.truncation_error` falls about as detail^-3, and is 0 if detail is large enough. A
-        coarse sample is as valid as any other; its `value_error` is larger.
-        """
-        del detail
-        return cast("Field", self)
+@dataclass(frozen=True)
+class VariableAccuracy:
+    """How a field can be sampled with different accuracy. An example is a sum over a tree of
+    sources, which treats a far cluster of sources as a single source. The farther a cluster must be
+    for that, the smaller is the truncation error and the higher the cost. The tracer starts with
+    coarse samples and refines them where the truncation error shortens steps.
 
-    def exact(self, backend: Backend) -> Field:
-        """This field with samples without truncation error (at the accuracy scale `EXACT`). The
-        field must be prepared for the backend. A field with a single accuracy is returned
-        unchanged."""
-        if not self.has_variable_accuracy:
-            return cast("Field", self)
-        closely: Any = copy.copy(self)
-        closely.evaluate = self.at_accuracy(backend.Float(EXACT)).evaluate
-        return closely
+    An accuracy scale is a number, which may differ from lane to lane. Larger is more accurate: 0
+    gives the coarsest samples of the field, 1 the samples of `Field.evaluate`, and a number above 1
+    more accurate samples.
+
+    at: a function that takes an accuracy scale and returns the field, sampled with it.
+        `Sample.truncation_error` falls about as the third power of the scale, and is 0 if the scale
+        is large enough (`EXACT`). A coarse sample is as valid as any other; its `value_error` is
+        larger.
+    coarsest: the accuracy scale of the coarsest samples, in (0, 1]. A smaller scale, such as 0,
+        gives no coarser samples, but for the next attribute.
+    may_lack_integer: whether samples with a scale below `coarsest` may give f only modulo 1. Those
+        samples set `Sample.branch_unknown`.
+    """
+
+    at: Callable[[Real], Field]
+    coarsest: float = 1.0
+    may_lack_integer: bool = False
+
+
+def exactly_sampled(field: Field, backend: Backend) -> Field:
+    """The field, sampled without truncation error; the field itself if it has a single accuracy.
+
+    field: a field that is prepared for the backend.
+    """
+    accuracy = field.variable_accuracy
+    return field if accuracy is None else accuracy.at(backend.Float(EXACT))

@@ -21,6 +21,7 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
 from harnack.fields.batched_fields import BatchedField, SumAtDetail, cached_prepare
+from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.field import Field
 from harnack.tree.empty_space import (
     BoxCells,
@@ -191,8 +192,8 @@ def level_distance_lower_bound(
     downward = longest_free_length(enclosures, LevelGaps(gaps.below, inf))
     # If a gap is 0 or less, the point may lie on a level set.
     distance = dr.select(gaps.nearest > 0, fmin(upward, downward), 0)
-    if field.has_jumps:
-        distance = fmin(distance, field.distance_to_jumps(p))
+    if field.jumps is not None:
+        distance = fmin(distance, field.jumps.distance(p))
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
 
 
@@ -253,23 +254,19 @@ class DeviceField(Field, Generic[Uploaded]):
             RuntimeError: `prepare` was not called.
         """
         if self._device is None:
-            raise RuntimeError("prepare(backend) comes first, before at_detail")
+            raise RuntimeError("prepare(backend) comes first")
         return self._device
 
     def _batch_data(self, backend: Backend) -> Uploaded:
         """The data for values at points, which are uploaded once for each backend and then
         cached."""
-        if backend not in self._batches:
-            self._batches[backend] = self._upload(backend, traced=False)
-        return self._batches[backend]
+        return self._batches.get_or_make(backend, lambda: self._upload(backend, traced=False))
 
 
 class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
     """A field that is a sum over sources, whose data lie on a backend, and that can be sampled at
     any accuracy. The accuracy scale says how accurately: larger is more accurate
-    (`Field.at_accuracy`). Subclasses define `_sample`."""
-
-    has_variable_accuracy = True
+    (`VariableAccuracy`). Subclasses define `_sample`."""
 
     has_separate_batch_data: ClassVar[bool] = True
     """Whether the data for values at points differ from the data for tracing rays."""
@@ -287,7 +284,16 @@ class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
         on = self._data_for(p)
         return self._sample(on, p, on.backend.Float(1))
 
-    def at_accuracy(self, detail: Real) -> Field:
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        return VariableAccuracy(self._at_accuracy, self._coarsest_accuracy())
+
+    def _coarsest_accuracy(self) -> float:
+        """The accuracy scale of the coarsest samples. The default is 1."""
+        return 1.0
+
+    def _at_accuracy(self, detail: Real) -> Field:
+        """The field, sampled with this accuracy scale."""
         on = self._require_data()
         # The accuracy scale of `values_at` must be at least 1.
         closer = fmax(on.backend.Float(detail), on.backend.Float(1))

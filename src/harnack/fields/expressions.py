@@ -70,6 +70,11 @@ class TextFormula:
     tree: ast.expr
     parameters: Mapping[str, float] = field(default_factory=dict[str, float])
 
+    def __post_init__(self) -> None:
+        """Convert the parameters to floats. Raises ValueError if one is not finite."""
+        numbers = {name: as_finite(number, name) for name, number in self.parameters.items()}
+        object.__setattr__(self, "parameters", numbers)
+
     @classmethod
     def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
         """Parse a text to a formula.
@@ -81,7 +86,7 @@ class TextFormula:
                 or a parameter is not in it; or the name of a parameter is already that of a
                 function, a constant or a coordinate.
         """
-        parameters = {name: as_finite(number, name) for name, number in (parameters or {}).items()}
+        parameters = parameters or {}
         if len(text) > _MAX_LENGTH:
             raise ValueError(f"a formula has at most {_MAX_LENGTH:,} characters, not {len(text):,}")
         # A character that no formula has, or a number that is not decimal, such as 0x1F.

@@ -32,7 +32,7 @@ from harnack.backend.validation import (
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
-from harnack.fields.capabilities import CommonBoundary, JumpSurface, PatchUnion, VariableAccuracy
+from harnack.fields.parameters import Parametrized, record_call
 from harnack.fields.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.geometry.volume import check_volume
 
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.capabilities import Boundary, Jumps, ModuloOne, Patches, VariableAccuracy
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -73,15 +74,15 @@ _SOLID_METHODS = frozenset(
 )
 
 
-class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
+class Field(Parametrized, abc.ABC):
     """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
     and its level set is the surface f = level. A sample at a point holds value and gradient of f
     there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
     per lane. A prepared field has its data on a backend (a Dr.Jit device and precision).
 
     Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
-    The base classes declare optional capabilities: jumps, patches, variable accuracy, and curves at
-    which level sets end. Their defaults describe a field that has none of these.
+    Optional capabilities are objects (`capabilities`): `jumps`, `modulo_one`, `patches`,
+    `boundary` and `accuracy`. They are None for a field that has none of these.
     """
 
     period: ClassVar[float | None] = None
@@ -121,11 +122,14 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make a field. Raises NotImplementedError for arguments with derivatives enabled, unless
-        the class defines `parameters`: their derivatives would be lost."""
-        if cls.has_no_parameters():
+        """Make a field, which remembers this call (`parameters`). Raises NotImplementedError for
+        arguments with derivatives enabled, unless the class has `has_parameter_derivatives`: their
+        derivatives would be lost."""
+        if not cls.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
-        return super().__new__(cls)
+        field = super().__new__(cls)
+        record_call(field, args, kwargs)
+        return field
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Replace methods of a new subclass. Its `evaluate` is wrapped so that the result is
@@ -231,6 +235,40 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
             object.__setattr__(prepared, name, value)  # also of frozen dataclasses
         return prepared
 
+    @property
+    def jumps(self) -> Jumps | None:
+        """The facets across which f jumps; None, the default, for a field without jumps."""
+        return None
+
+    @property
+    def modulo_one(self) -> ModuloOne | None:
+        """How f is sampled up to an unknown integer; None, the default, if it is not."""
+        return None
+
+    @property
+    def patches(self) -> Patches | None:
+        """The patches of a surface that is a union of many level sets, each of a function of its
+        own; None, the default, for a field with one function."""
+        return None
+
+    @property
+    def boundary(self) -> Boundary | None:
+        """The curves and points at which all level sets end; None, the default, if there are
+        none."""
+        return None
+
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        """How f is sampled with different accuracy; None, the default, for a single accuracy."""
+        return None
+
+    def with_levels(self, levels: tuple[float, ...]) -> Field:
+        """The field by which the level sets of these levels are traced, not yet prepared for a
+        backend; for example with the boxes of their patches. Equal levels must return the same
+        object. The default is the field itself."""
+        del levels
+        return self
+
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets of these levels; None if
         no such volume is known.
@@ -278,30 +316,18 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         levels."""
         del levels
 
-    def parameters(self) -> tuple[Any, ...]:
-        """The Dr.Jit arrays on which f depends and that may have derivatives enabled, for example
-        the vertices of a mesh that is optimized.
-
-        A class that does not define this method has no such parameters, and its constructor refuses
-        arguments with derivatives enabled.
-        """
-        return ()
-
-    @classmethod
-    def has_no_parameters(cls) -> bool:
-        """Whether the class does not define `parameters`. Then derivatives with respect to the
-        numbers in its fields would be lost."""
-        return cls.parameters is Field.parameters
-
     def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
-        example in its formula, although its class does not define `parameters`. These derivatives
-        would be lost."""
-        if self.has_no_parameters():
-            kind = type(self)
-            # The `evaluate` of a user's class may refer to such numbers, too.
-            is_own = not kind.__module__.startswith("harnack.")
-            check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
+        example in its formula, although its class does not have `has_parameter_derivatives`, or
+        none of them is one of its `parameters`. These derivatives would be lost."""
+        kind = type(self)
+        # The `evaluate` of a user's class may refer to such numbers, too.
+        is_own = not kind.__module__.startswith("harnack.")
+        if self.has_parameter_derivatives and (
+            not is_own or any(map(dr.grad_enabled, self.differentiable_parameters()))
+        ):
+            return
+        check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's
@@ -313,7 +339,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         equal). A field with parameters overrides this method if `evaluate` cannot be differentiated
         in both modes.
         """
-        if any(dr.grad_enabled(parameter) for parameter in self.parameters()):
+        if any(dr.grad_enabled(parameter) for parameter in self.differentiable_parameters()):
             return self.evaluate(p).value
         self.refuse_hidden_parameters()
         at = dr.detach(p)
@@ -343,7 +369,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         """
         if dr.is_array_v(type(points)):
             self.refuse_hidden_parameters()
-            if any(dr.grad_enabled(array) for array in (points, *self.parameters())):
+            if any(dr.grad_enabled(array) for array in (points, *self.differentiable_parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
@@ -363,7 +389,9 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         self.refuse_hidden_parameters()
-        check_no_derivatives(f"the gradient of {type(self).__name__}", self.parameters())
+        check_no_derivatives(
+            f"the gradient of {type(self).__name__}", self.differentiable_parameters()
+        )
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():
@@ -440,7 +468,7 @@ class Field(JumpSurface, PatchUnion, VariableAccuracy, CommonBoundary, abc.ABC):
 
 class EvaluateOnly(Field):
     """A field that consists of its method `evaluate` only, such as the result of
-    `Field.at_accuracy`. Its constructor takes the function that returns the sample at a point."""
+    `VariableAccuracy.at`. Its constructor takes the function that returns the sample at a point."""
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
         self._evaluate = evaluate

@@ -16,7 +16,7 @@ import copy
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -446,8 +446,7 @@ def as_jet(value: Any, like: Jet, name: str) -> Jet:
 class FormulaOnRay:
     """A formula f along a line, as the function F(s) = f(p + s d) of the length s. The line is cut
     into pieces at given lengths, the knots. For each piece, jets give proved ranges of F' and F''.
-    It is an `EvaluableRestriction`, from which enclosures (bounds of the change of f along a ray)
-    are made.
+    Enclosures (bounds of the change of f along a ray) are made from it.
 
     field: the field with the formula.
     p, direction: (3,) p and d.
@@ -484,16 +483,6 @@ class FormulaOnRay:
         knots: increasing lengths s, the first of them 0.
         """
         return tuple(self._piece(start, end) for start, end in itertools.pairwise(knots))
-
-    def evaluate_with(self, coordinates: Callable[[Vec3, Vec3], tuple[Any, Any, Any]]) -> Any:
-        """The value of the formula in another arithmetic: at the three numbers (x, y, z) =
-        coordinates(p, d).
-
-        coordinates: a function that makes three numbers of that arithmetic from p and d.
-        """
-        x, y, z = coordinates(self.p, self.direction)
-        value = self.field.formula(x, y, z)
-        return x.constant(float(value)) if isinstance(value, int | float) else value
 
     def _piece(self, start: Real, end: Real) -> PathPiece:
         """The proved ranges of F' and F'' on the piece start <= s <= end of the line."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from harnack.cluster.serialization import TransientCache
 from harnack.fields.batched_fields import cached_prepare
-from harnack.fields.capabilities import PatchEntry
+from harnack.fields.capabilities import PatchEntry, Patches
 from harnack.fields.clearance import UnitFrame, frame_parameters, round_to_single
 from harnack.fields.field import Field
 from harnack.geometry import Box
@@ -82,7 +82,7 @@ class HasPatchBoxes(Protocol):
 _Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
 
 
-class PatchField(Field, Generic[_Buffers]):
+class PatchField(Field, Patches, Generic[_Buffers]):
     """A field whose surface is a union of patches. Each patch is a level set of a function of its
     own, and lies in a box of its own. The boxes depend on the levels. A prepared field has its data
     (boxes and functions) on a backend.
@@ -90,7 +90,9 @@ class PatchField(Field, Generic[_Buffers]):
     levels: the levels whose patches lie in the boxes of the prepared field.
     """
 
-    has_patches: bool = True
+    @property
+    def patches(self) -> Patches | None:
+        return self
 
     def __init__(self) -> None:
         self.levels: tuple[float, ...] = (self.default_level,)
@@ -138,7 +140,7 @@ class PatchField(Field, Generic[_Buffers]):
             raise RuntimeError("prepare(backend) comes first")
         return self._device
 
-    def next_patch(
+    def next_entry(
         self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
     ) -> PatchEntry:
         return self._require_data().boxes.next(o, d, after, start, end, active)

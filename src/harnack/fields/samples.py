@@ -51,13 +51,13 @@ class Sample:
         the gradient is of no use; None for the direction of the gradient. Steps do not depend on
         it.
     truncation_error: the part of `value_error` that becomes smaller if f is sampled with higher
-        accuracy (`Field.at_accuracy`).
+        accuracy (`capabilities.VariableAccuracy`).
     alternative_promises: proved bounds that are also valid, but gave shorter steps than `promises`
         in every measurement. They are used only if the caller names the enclosures to use.
     ray_promises: bounds that hold only on one ray through p: Lipschitz constants of f there. Only
         samples of `Field.sample_ray` have them.
     branch_unknown: a mask, true on lanes on which `value` may differ from f by an unknown integer
-        (`JumpSurface.has_unknown_branch`); None if there are no such lanes.
+        (`VariableAccuracy.may_lack_integer`); None if there are no such lanes.
     """
 
     value: Real
@@ -154,7 +154,7 @@ def validate_samples(
                 f"{_SAMPLE_HELP}"
             )
         # Derivatives of the value that do not come from p would be lost.
-        if self.has_no_parameters() and not dr.grad_enabled(p):
+        if not self.has_parameter_derivatives and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)
 

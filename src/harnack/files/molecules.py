@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gemmi
 import numpy as np
 
 from harnack.backend import FloatArray
@@ -66,6 +65,8 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         FileFormatError: malformed data, no atoms of known elements, or coordinates that are not
             finite.
     """
+    import gemmi  # imported here, as few programs read molecules
+
     place = FileLocation(path)
     if b"\0" in data:
         raise place.error("this is binary data, not the text that its extension announces")

@@ -6,7 +6,6 @@ letters and SVG paths are replaced by polylines within a stated tolerance.
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 import re
@@ -24,6 +23,7 @@ from harnack.backend.validation import as_integer_in_range, as_positive
 from harnack.files.file_geometry import FileFormatError
 from harnack.geometry.beziers import flatten_bezier
 from harnack.geometry.outline_loops import FillingRule, Outline, make_outline
+from harnack.optional_packages import import_optional
 
 __all__ = ["regular_polygon", "svg", "text"]
 
@@ -48,16 +48,11 @@ def regular_polygon(sides: int, radius: float) -> Outline:
     return make_outline(as_positive(radius, "the radius of a polygon") * corners)
 
 
-def _import_optional(module: str) -> Any:
+def _import_package(module: str) -> Any:
     """Import a module of an optional package (matplotlib, for text, or svgpathtools, for SVG
     paths). Raises a ModuleNotFoundError that says how to install it."""
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError:
-        package = module.partition(".")[0]
-        raise ModuleNotFoundError(
-            f'this outline needs {package}: pip install "harnack[outlines]"'
-        ) from None
+    package = module.partition(".")[0]
+    return import_optional(module, f'this outline needs {package}: pip install "harnack[outlines]"')
 
 
 # Text.
@@ -120,7 +115,7 @@ def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> lis
     Raises:
         ValueError: an unknown font, or a letter that it lacks.
     """
-    manager = _import_optional("matplotlib.font_manager")
+    manager = _import_package("matplotlib.font_manager")
     if font is not None and Path(font).suffix.lower() in (".ttf", ".otf", ".ttc"):
         if not Path(font).is_file():
             raise ValueError(f"there is no font file {os.fspath(font)}")
@@ -128,7 +123,7 @@ def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> lis
     else:
         properties = manager.FontProperties(family="DejaVu Sans" if font is None else str(font))
     try:
-        face = _import_optional("matplotlib.ft2font").FT2Font(
+        face = _import_package("matplotlib.ft2font").FT2Font(
             manager.findfont(properties, fallback_to_default=False)
         )
     except ValueError:
@@ -142,7 +137,7 @@ def _text_line_loops(line: str, font: Any, size: float, max_error: float) -> lis
             raise ValueError(
                 f"the font {face.family_name} has no letter {letter!r}: choose another by font="
             )
-    text_to_path = _import_optional("matplotlib.textpath").TextToPath()
+    text_to_path = _import_package("matplotlib.textpath").TextToPath()
     points, codes = text_to_path.get_text_path(properties, line, ismath=False)
     # matplotlib makes letters of its own font size.
     scale = size / text_to_path.FONT_SCALE
@@ -313,7 +308,7 @@ def _filled_shapes(
     if styles.get("transform", "none") != "none" or "transform-origin" in styles:
         raise ValueError("transforms in styles are not read, nor a transform-origin: apply them")
     if "transform" in element.attrib:
-        parse_transform = _import_optional("svgpathtools.parser").parse_transform
+        parse_transform = _import_package("svgpathtools.parser").parse_transform
         local_transform: FloatArray = parse_transform(element.attrib["transform"], strict=True)
         transform = transform @ local_transform
     # Shapes that cannot be seen are left out, but the elements in them are looked at.
@@ -361,7 +356,7 @@ def _path_data(element: Element) -> str:
     Raises:
         ValueError: a length with a unit, or a size that is negative or not finite.
     """
-    converters = _import_optional("svgpathtools.svg_to_paths")
+    converters = _import_package("svgpathtools.svg_to_paths")
     attrib, tag = {k: v.removesuffix("px") for k, v in element.attrib.items()}, element.tag
     if tag == "path":
         return attrib.get("d", "")
@@ -433,7 +428,7 @@ def _segments(data: str) -> list[Any]:
     Raises:
         ValueError: malformed data, or a number that is not finite.
     """
-    parse_path = _import_optional("svgpathtools.parser").parse_path
+    parse_path = _import_package("svgpathtools.parser").parse_path
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", "Replacing degenerate")  # an arc of radius 0 is a line

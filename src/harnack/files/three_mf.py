@@ -25,10 +25,7 @@ from harnack.files.file_geometry import (
     triangles_as_polygons,
 )
 
-__all__ = ["REQUIRED_PACKAGES", "read_3mf"]
-
-REQUIRED_PACKAGES = ("lxml", "networkx")
-"""Packages that trimesh needs to read 3MF."""
+__all__ = ["missing_packages", "read_3mf"]
 
 # The length of each unit of the format in millimeters. The names are in the singular, as in the
 # format; trimesh has the plural.
@@ -36,6 +33,14 @@ _UNITS = {
     "micron": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "inch": 25.4, "foot": 304.8,
     "meter": 1000.0,
 }  # fmt: skip
+
+
+def missing_packages() -> str:
+    """Return a text that names the packages without which trimesh cannot read and write 3MF, and
+    how they are installed; "" if none is missing."""
+    required = ("lxml", "networkx")
+    missing = [name for name in required if importlib.util.find_spec(name) is None]
+    return f"3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]'" if missing else ""
 
 
 def read_3mf(path: Path, data: bytes) -> FileGeometry:
@@ -50,9 +55,8 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
     import trimesh  # here, since it takes half a second
 
     place = FileLocation(path)
-    missing = [name for name in REQUIRED_PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise place.error(f"3MF needs {' and '.join(missing)}: pip install 'harnack[3mf]'")
+    if missing := missing_packages():
+        raise place.error(missing)
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())

@@ -30,14 +30,8 @@ __all__ = [
     "MAX_VERTICES",
     "Circle",
     "CurveError",
-    "CurveScaleError",
-    "CurveShapeError",
     "Loops",
     "LoopsLike",
-    "NonFiniteVertexError",
-    "RepeatedVertexError",
-    "TooFewVerticesError",
-    "TooManyVerticesError",
     "bounding_box",
     "cancel_opposite_circles",
     "edge_endpoints",
@@ -175,30 +169,6 @@ class CurveError(ValueError):
     """A curve cannot be used; the message says why and what to do."""
 
 
-class CurveShapeError(CurveError):
-    """A curve is not an array of numbers of shape (n, 3), or a list of such arrays."""
-
-
-class NonFiniteVertexError(CurveError):
-    """A vertex has a coordinate that is NaN or infinite."""
-
-
-class TooFewVerticesError(CurveError):
-    """A curve has fewer than three different vertices."""
-
-
-class TooManyVerticesError(CurveError):
-    """A curve has more than MAX_VERTICES vertices."""
-
-
-class RepeatedVertexError(CurveError):
-    """Two consecutive vertices of a curve are equal."""
-
-
-class CurveScaleError(CurveError):
-    """A curve is so large or so small that lengths overflow or vanish."""
-
-
 def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     """Validate loops. Returns a tuple of new float64 arrays (n, 3). A loop closes by itself. If its
     last vertex repeats its first, the last is dropped; any other vertex equal to the one before it
@@ -208,11 +178,11 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     closed: False for open curves, which end at their first and last vertex; these two may be equal.
 
     Raises:
-        CurveError: the subclass above that names the fault.
+        CurveError: the loops are malformed; the message names the fault.
     """
     parts = _as_list(loops)
     if not parts:
-        raise CurveShapeError("there are no loops: give an array (n, 3) or a list of them")
+        raise CurveError("there are no loops: give an array (n, 3) or a list of them")
     is_list = len(parts) > 1
     kind = "loop" if closed else "curve"
     names = [f"{kind} {k}" if is_list else f"the {kind}" for k, _ in parts]
@@ -220,7 +190,7 @@ def validate_loops(loops: LoopsLike, *, closed: bool = True) -> Loops:
     checked = [_validate_loop(part, name, closed) for (_, part), name in pairs]
     total = sum(len(loop) for loop in checked)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many("the curve", total))
+        raise CurveError(_too_many("the curve", total))
     return tuple(checked)
 
 
@@ -231,7 +201,7 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
         circle.
 
     Raises:
-        CurveError: a loop is malformed; the subclass names the fault.
+        CurveError: a loop is malformed; the message names the fault.
     """
     if isinstance(curves, Circle):
         return (), (curves,)
@@ -246,7 +216,7 @@ def validate_curves(curves: Any) -> tuple[Loops, tuple[Circle, ...]]:
     ]
     total = sum(len(loop) for loop in loops)
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many("the curve", total))
+        raise CurveError(_too_many("the curve", total))
     return tuple(loops), circles
 
 
@@ -261,13 +231,13 @@ def _as_list(loops: Any) -> list[tuple[int, Any]]:
     single loop. Numbers and shapes of the loops are not checked here.
 
     Raises:
-        CurveShapeError: the points of a single loop have different numbers of coordinates.
+        CurveError: the points of a single loop have different numbers of coordinates.
     """
     try:
         array = np.asarray(loops)
     except ValueError:  # loops of different lengths, or points of different lengths
         if any(_is_point(part) for part in loops):
-            raise CurveShapeError("every vertex needs three coordinates: some differ") from None
+            raise CurveError("every vertex needs three coordinates: some differ") from None
         # Loops of different lengths.
         return _numbered(loops)
     if array.ndim == 3:
@@ -301,15 +271,15 @@ def _validate_loop(loop: Any, name: str, closed: bool = True) -> FloatArray:
     closed: False for a curve that ends at its first and last vertex.
 
     Raises:
-        CurveError: the subclass that names the fault.
+        CurveError: the loop is malformed; the message names the fault.
     """
     vertices = _as_vertices(loop, name)
-    check_finite(vertices, f"vertex {{}} of {name}", NonFiniteVertexError)
+    check_finite(vertices, f"vertex {{}} of {name}", CurveError)
     if closed and len(vertices) > 1 and (vertices[0] == vertices[-1]).all():
         vertices = vertices[:-1]
     distinct = _count_distinct(vertices)
     if distinct < 3:
-        raise TooFewVerticesError(
+        raise CurveError(
             f"{name} has {distinct} different vertices: {'a closed' if closed else 'such a'} curve "
             "needs at least 3"
         )
@@ -323,15 +293,14 @@ def _as_vertices(loop: Any, name: str) -> FloatArray:
     name: what the loop is, for messages.
 
     Raises:
-        CurveShapeError: they are not numbers of that shape.
-        TooManyVerticesError: there are too many.
+        CurveError: they are not numbers of that shape, or there are too many.
     """
     ragged = "is ragged: every vertex needs three coordinates"
-    array = as_real_array(loop, name, CurveShapeError, ragged=ragged)
+    array = as_real_array(loop, name, CurveError, ragged=ragged)
     planar = "; append a column of zeros to a planar curve"
-    check_vectors(array, name, CurveShapeError, planar=planar, transposed=TRANSPOSE_ADVICE)
+    check_vectors(array, name, CurveError, planar=planar, transposed=TRANSPOSE_ADVICE)
     if len(array) > MAX_VERTICES:
-        raise TooManyVerticesError(_too_many(name, len(array)))
+        raise CurveError(_too_many(name, len(array)))
     return np.array(array, dtype=np.float64, order="C")
 
 
@@ -347,8 +316,8 @@ def _count_distinct(vertices: FloatArray) -> int:
 
 
 def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
-    """Raise RepeatedVertexError for an edge of length zero, and CurveScaleError for lengths that
-    overflow or underflow.
+    """Raise CurveError for an edge of length zero, and for lengths that overflow or
+    underflow.
 
     vertices: (n, 3).
     name: what the loop is, for messages.
@@ -361,14 +330,14 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
     zero_edges = np.flatnonzero((edges == 0).all(axis=1))
     if zero_edges.size:
         first, second = int(zero_edges[0]), (int(zero_edges[0]) + 1) % len(vertices)
-        raise RepeatedVertexError(
+        raise CurveError(
             f"vertices {first} and {second} of {name} are both {format_vector(vertices[first])}"
             f"{others_suffix(zero_edges.size)}: remove one of them"
         )
     size = float(np.abs(vertices).max())
     shortest = float(np.abs(edges).max(axis=1).min())
     if size > 1e100 or shortest < 1e-100:
-        raise CurveScaleError(
+        raise CurveError(
             f"{name} has coordinates up to {size:g} and an edge as short as {shortest:g}: "
             "choose units that bring it nearer to 1"
         )

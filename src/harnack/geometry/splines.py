@@ -6,15 +6,9 @@ import operator
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from harnack.backend.validation import FloatArray
-from harnack.geometry.curves import (
-    MAX_VERTICES,
-    CurveScaleError,
-    TooManyVerticesError,
-    validate_loops,
-)
+from harnack.geometry.curves import MAX_VERTICES, CurveError, validate_loops
 
 if TYPE_CHECKING:
     from harnack.geometry.curves import LoopsLike
@@ -64,9 +58,7 @@ def smooth_curve(
     loops = validate_loops(points, closed=closed)
     total = sum(map(len, loops)) * samples_per_segment
     if total > MAX_VERTICES:
-        raise TooManyVerticesError(
-            f"{total:,} vertices are more than {MAX_VERTICES:,}: take fewer samples"
-        )
+        raise CurveError(f"{total:,} vertices are more than {MAX_VERTICES:,}: take fewer samples")
     curves = [_spline(loop, samples_per_segment, closed, _POWERS[spacing]) for loop in loops]
     return curves if _is_list(points) else curves[0]
 
@@ -107,7 +99,7 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
         distance.
 
     Raises:
-        CurveScaleError: two consecutive points are so near that their parameters are equal.
+        CurveError: two consecutive points are so near that their parameters are equal.
     """
     knots = np.concatenate([x, x[:1]]) if closed else x
     chords = np.diff(knots, axis=0)
@@ -115,10 +107,12 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
     parameters = np.concatenate([[0.0], np.cumsum(length**power)])
     if (np.diff(parameters) <= 0).any():
         k = int(np.flatnonzero(np.diff(parameters) <= 0)[0])
-        raise CurveScaleError(
+        raise CurveError(
             f"points {k} and {(k + 1) % len(x)} are nearer to each other than rounding, beside the "
             "length of the curve: remove one of them"
         )
+    from scipy.interpolate import CubicSpline  # imported here: it takes half a second
+
     spline = CubicSpline(parameters, knots, bc_type="periodic" if closed else "not-a-knot")
     inner = parameters[:-1, None] + np.diff(parameters)[:, None] * (np.arange(samples) / samples)
     vertices = spline(inner.ravel())

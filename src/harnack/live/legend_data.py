@@ -9,23 +9,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.rendering.aov_render import STATUS_COLORS
 from harnack.rendering.images import to_uint8
 from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
 from harnack.rendering.scales import viridis
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = [
-    "EVALUATIONS_TOP", "FAR_GRAY", "HIT_COLOR", "NEAR_GRAY", "evaluations_share", "legends",
+    "EVALUATIONS_TOP", "FAR_GRAY", "NEAR_GRAY", "css_color", "evaluations_share", "legends",
 ]  # fmt: skip
 
 # The evaluations that are brightest, and where a scale of them has ticks.
 EVALUATIONS_TOP = 64
 _EVALUATIONS = (0, 3, 15, EVALUATIONS_TOP)
 _STOPS = 13
-# sRGB of what is nearest, of what is farthest, and of what is hit: also in passes.wgsl.
-NEAR_GRAY, FAR_GRAY, HIT_COLOR = 0.95, 0.12, (0.93, 0.93, 0.90)
+# sRGB of what is nearest, and of what is farthest.
+NEAR_GRAY, FAR_GRAY = 0.95, 0.12
 
 
 def evaluations_share(evaluations: Any) -> Any:
@@ -43,38 +45,45 @@ def legends() -> dict[str, Any]:
     the scale and a label. "ticks" is None if the labels are the least and the greatest number in
     the picture. "swatches" are pairs of a name and its CSS color (None for the background).
     """
-    out_of_steps_swatch = ["out of steps", _css(OUT_OF_STEPS_COLOR)]
+    out_of_steps_swatch = ["out of steps", css_color(OUT_OF_STEPS_COLOR)]
+    hit_swatch = ["hit", css_color(STATUS_COLORS[RayStatus.HIT])]
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [
         [1.0, f"{EVALUATIONS_TOP}+"]
     ]
     return {
         "evaluations": {
             "title": "evaluations of a ray, log scale",
-            "colors": [_css(color) for color in viridis(np.linspace(0, 1, _STOPS))],
+            "colors": [css_color(color) for color in viridis(np.linspace(0, 1, _STOPS))],
             "ticks": ticks,
             "swatches": [out_of_steps_swatch],
         },
         "depth": {
             "title": "depth, in units of the surface",
-            "colors": [_css((gray,) * 3) for gray in (NEAR_GRAY, FAR_GRAY)],
+            "colors": [css_color((gray,) * 3) for gray in (NEAR_GRAY, FAR_GRAY)],
             "ticks": None,
             "swatches": [out_of_steps_swatch],
         },
         "normal": {
             "title": "normal: x, y, z as red, green, blue",
             "swatches": [
-                *([f"+{axis}", _css(0.5 + 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
-                *([f"-{axis}", _css(0.5 - 0.5 * np.eye(3)[k])] for k, axis in enumerate("xyz")),
+                *(
+                    [f"+{axis}", css_color(0.5 + 0.5 * np.eye(3)[k])]
+                    for k, axis in enumerate("xyz")
+                ),
+                *(
+                    [f"-{axis}", css_color(0.5 - 0.5 * np.eye(3)[k])]
+                    for k, axis in enumerate("xyz")
+                ),
                 out_of_steps_swatch,
             ],
         },
         "status": {
             "title": "outcome of a ray",
-            "swatches": [["hit", _css(HIT_COLOR)], ["miss", None], out_of_steps_swatch],
+            "swatches": [hit_swatch, ["miss", None], out_of_steps_swatch],
         },
     }
 
 
-def _css(color: Sequence[float] | Any) -> str:
+def css_color(color: Sequence[float] | Any) -> str:
     """Return an sRGB color of three numbers from 0 to 1 as CSS text, such as "#f2f2f2"."""
     return "#" + bytes(to_uint8(np.array(color, np.float64))).hex()

@@ -29,9 +29,10 @@ from harnack.geometry import HalfSpace, Volume, VolumeIntersection
 from harnack.live.legend_data import EVALUATIONS_TOP, legends
 from harnack.live.live_framing import Framing, extreme_points
 from harnack.live.scene_file import FieldSources, to_scene_text, with_flat_options
+from harnack.live.shading_data import scene_shading
 from harnack.live.sliders import SliderValueError, SlidingContent, slider_values_in_errors
 from harnack.rendering import render
-from harnack.rendering.backdrops import FLOOR_HEIGHT, GroundBackdrop, parse_backdrop, reflectance_of
+from harnack.rendering.backdrops import FLOOR_HEIGHT, GroundBackdrop, parse_backdrop
 from harnack.rendering.camera import Camera
 from harnack.rendering.framing import NothingVisibleError, bounding_box, visible_points
 from harnack.rendering.isolines import parse_isolines
@@ -247,7 +248,8 @@ class LiveScene:
             "camera": self.framing.camera,
             "floor": FLOOR_HEIGHT,
             "show": self.show,
-            "ground": reflectance_of(self.backdrop).tolist(),
+            "ground": self.backdrop,
+            "shading": scene_shading(),
             "sliders": [
                 {"name": name, "low": slider.low, "high": slider.high, "start": slider.start,
                  "step": slider.step}
@@ -321,7 +323,8 @@ class LiveScene:
         for k, body in enumerate(objects):
             # Surfaces of the same field have the same curves.
             if all(body.surface.field is not other.surface.field for other in objects[:k]):
-                curves += body.surface.field.boundary_curves
+                boundary = body.surface.field.boundary
+                curves += () if boundary is None else boundary.curves
         return {"surfaces": surfaces, "curves": [np.asarray(curve).tolist() for curve in curves]}
 
     def surfaces_at(self, controls: ControlState) -> list[StudioObject]:

@@ -26,8 +26,9 @@ from harnack.cluster.executor import Executor, TaskResult, open_executor
 from harnack.files.file_geometry import write_atomically
 from harnack.live.live_scene import ControlState, LiveScene, encode_arrays, state_delta
 from harnack.live.scene_file import with_flat_options
+from harnack.live.shading_data import shader_constants
 from harnack.live.sliders import slider_values_in_errors
-from harnack.progress import progress_bar
+from harnack.progress import show_progress
 from harnack.rendering.camera import Camera
 from harnack.rendering.mitsuba import set_variant
 from harnack.rendering.mitsuba_plugins import register
@@ -37,7 +38,9 @@ if TYPE_CHECKING:
     from harnack.live.live_scene import JsonDict
     from harnack.tracer import TraceOptions
 
-__all__ = ["MODULES", "check_title", "document", "page", "resource", "script", "still_png"]
+__all__ = [
+    "MODULES", "check_title", "document", "page", "passes", "resource", "script", "still_png",
+]  # fmt: skip
 
 _STILL_SIZE = (640, 480)
 # The largest number of values of a slider without a step; the number of combinations of values of
@@ -113,11 +116,11 @@ def page(
         raise ValueError(f"{target}: a page is written as .html")
     # The states for all slider values are computed part by part, here or on a cluster.
     job = PageJob(surfaces, settings, register().variant())
-    with progress_bar("page", progress) as advance:
+    with show_progress("page", progress) as reporter:
         live = job.live
         scene = live.scene(title or live.content.name)
-        with open_executor(client, checkpoint) as workers:
-            scene["frames"] = _slider_states(job, workers, advance)
+        with open_executor(job, client, checkpoint) as workers:
+            scene["frames"] = _slider_states(job, workers, reporter.advance)
     text = document(scene, still_png(live)).encode()
     with write_atomically(target) as partial:
         partial.write_bytes(text)
@@ -281,7 +284,7 @@ def _slider_states(job: PageJob, workers: Executor, advance: Any) -> JsonDict:
     """
     frames: list[JsonDict] = []
     tasks = [(values, job.digest) for values in _slider_combinations(job.places)]
-    for result in workers.run_tasks(job, "state", tasks):
+    for result in workers.run_tasks("state", tasks):
         frames.append(json.loads(result["text"].tobytes()))
         advance(1 / len(tasks))
     return {"places": job.places, "frames": frames}
@@ -303,17 +306,22 @@ def document(scene: Mapping[str, Any], still: str, link: str = "frames") -> str:
     link: where the page gets other states from: "frames" for states stored in it, or "server" for
         Python's answers.
     """
-    passes = json.dumps(resource("passes.wgsl"))
     return _PAGE.substitute(
         title=html.escape(scene["title"]),
         style=resource("panel.css"),
         # Text must not end the element in which it stands.
         script=script(*MODULES).replace("</script", "<\\/script"),
-        passes=passes.replace("</", "<\\/"),
+        passes=json.dumps(passes()).replace("</", "<\\/"),
         scene=json.dumps(scene).replace("<", "\\u003c"),
         still=still,
         link=_CHANNEL_SCRIPTS[link],
     )
+
+
+def passes() -> str:
+    """Return the shaders of a page, in WGSL: the constants of shading, and the text of
+    passes.wgsl."""
+    return shader_constants() + resource("passes.wgsl")
 
 
 def resource(name: str) -> str:

@@ -30,7 +30,6 @@ import { applyDelta } from "./slider_states.js";
  *     onProgress?: (completed: number, cancel: () => void) => void): Promise<any>,
  * }} Channel */
 
-const GROUND_REFLECTANCES = { light: [0.74, 0.73, 0.715], dark: [0.055, 0.058, 0.065] };
 /** The parameters of the volumes that cut the surfaces: least, greatest and first value.
  *  @type {Record<string, Record<string, number[]>>} */
 const CUT_PARAMETERS = {
@@ -61,7 +60,7 @@ export class Panel {
     /** @type {Record<string, number>} */
     this.sliderValues = Object.fromEntries(scene.sliders.map(({ name, start }) => [name, start]));
     this.mode = scene.show;
-    this.ground = scene.ground[0] < 0.3 ? "dark" : "light";
+    this.ground = scene.ground;
     /** @type {RenderOptions} */
     this.renderOptions = {};
     this.cutKind = "none";
@@ -168,7 +167,7 @@ export class Panel {
       { name: "show", onchange: () => { this.mode = mode.value; this.redraw(); } }, ...createOptions(MODES));
     const ground = createElement("select",
       { onchange: () => { this.ground = ground.value; this.redraw(); } },
-      ...createOptions(Object.keys(GROUND_REFLECTANCES)));
+      ...createOptions(Object.keys(this.scene.shading.reflectance)));
     [mode.value, ground.value] = [this.mode, this.ground];
     this.modeSelect = mode;
     return [createElement("label", {}, "Show ", mode), createElement("label", {}, "Ground ", ground)];
@@ -500,7 +499,7 @@ export class Panel {
     const { scale } = this.placement;
     const elements = legend && (this.renderer || this.isRemote) ? [createLegend(
       legend, range && [range[0] / scale, range[1] / scale],
-      this.ground === "dark" ? "#1a1a1c" : "#e6e6e3")] : [];
+      this.scene.shading.css_background[this.ground])] : [];
     this.legend.replaceChildren(...elements);
   }
 
@@ -513,7 +512,7 @@ export class Panel {
     renderer.mode = this.mode;
     renderer.lines = this.lines;
     renderer.dots = this.dots;
-    renderer.groundReflectance = GROUND_REFLECTANCES[/** @type {"light" | "dark"} */ (this.ground)];
+    renderer.ground = this.ground;
     renderer.draw();
   }
 

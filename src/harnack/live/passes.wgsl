@@ -1,5 +1,6 @@
 // The passes around a traced kernel: rays of the camera, hits, the light of shaded pictures
-// (harnack.rendering.shading), and lines and dots in front of the picture.
+// (harnack.rendering.shading), and lines and dots in front of the picture. The constants of shading,
+// such as KEY_WRAP, are written before this text: see `passes` in harnack.live.shading_data.
 
 struct PassUniforms {
   eye: vec4f,         // on the stage; w: the number of directions along which the sky is estimated
@@ -44,11 +45,6 @@ const KIND_NONE = 0u; const KIND_GROUND = 1u; const KIND_SURFACE = 2u; const KIN
 // The mode of a picture.
 const MODE_SHADED = 0u; const MODE_NORMAL = 1u; const MODE_DEPTH = 2u;
 const MODE_EVALUATIONS = 3u; const MODE_STATUS = 4u;
-// The floor: see floor_light.js.
-const FLOOR_CELLS = 64u; const RAYS_PER_CELL = 8u; const SAMPLE_BLOCK = 4u;
-const FLOOR_HALF_WIDTH = 2.4; const FLOOR_RAY_LENGTH = 3.5; const MAX_GROUND_RADIUS = 100.0;
-// The samples along each direction of the sky, and the part of the picture that they span.
-const SKY_SAMPLES = 8u; const SKY_REACH = 0.16;
 const NO_HIT_T = 3.0e38;
 const TWO_PI = 6.2831853;
 
@@ -89,7 +85,7 @@ fn clear_hits(@builtin(global_invocation_id) id: vec3u) {
   let ground_t = (uniforms.key.w - uniforms.eye.z) / min(direction.z, -1e-9);
   let ground_point = uniforms.eye.xyz + ground_t * direction;
   let has_ground = uniforms.ground.w > 0.5 && uniforms.mode == MODE_SHADED;
-  if (has_ground && direction.z < 0.0 && length(ground_point.xy) < MAX_GROUND_RADIUS) {
+  if (has_ground && direction.z < 0.0 && length(ground_point.xy) < FLOOR_RADIUS) {
     t = ground_t; kind = KIND_GROUND;
   }
   write_hit(pixel, t, direction, vec3f(0.0, 0.0, 1.0), kind);
@@ -191,7 +187,7 @@ fn horizon_height(pixel: u32, normal: vec3f, across: vec2f, reach: f32, radius: 
     if (!is_visible(sample_pixel)) { continue; }
     let displacement = hit_position(sample_pixel) - position;
     let distance = max(length(displacement), 1e-12);
-    let height = dot(displacement, normal) / distance - 0.06;
+    let height = dot(displacement, normal) / distance - LEAST_SINE;
     if (height > 0.0) {
       let falloff = max(1.0 - (distance / radius) * (distance / radius), 0.0);
       horizon = max(horizon, height * falloff);
@@ -200,23 +196,19 @@ fn horizon_height(pixel: u32, normal: vec3f, across: vec2f, reach: f32, radius: 
   return horizon;
 }
 
-// Irradiance over pi, linear sRGB: of the key light at its brightest, of the sky and of the ground.
-const KEY_IRRADIANCE = vec3f(0.74, 0.71, 0.66);
-const SKY_IRRADIANCE = vec3f(0.36, 0.40, 0.46);
-const GROUND_IRRADIANCE = vec3f(0.25, 0.225, 0.20);
-
 // The radiance of a point in the studio's light: `StudioLight.shade`. eye: the unit vector to the camera.
 // visible_sky, visible_key: the fractions of the sky and of the key light that reach the point.
 fn shaded_color(
   color: vec3f, normal: vec3f, eye: vec3f, is_glossy: bool, visible_sky: f32, visible_key: f32,
 ) -> vec3f {
-  let wrapped = clamp((dot(normal, uniforms.key.xyz) + 0.25) / 1.25, 0.0, 1.0);
-  let key_fraction = (1.0 - 0.6 * (1.0 - visible_sky)) * visible_key;
+  let wrapped = clamp((dot(normal, uniforms.key.xyz) + KEY_WRAP) / (1.0 + KEY_WRAP), 0.0, 1.0);
+  let key_fraction = (1.0 - KEY_HIDDEN * (1.0 - visible_sky)) * visible_key;
   let sky = mix(GROUND_IRRADIANCE, SKY_IRRADIANCE, 0.5 + 0.5 * dot(normal, uniforms.up.xyz)) * visible_sky;
   let radiance = color * (KEY_IRRADIANCE * (wrapped * key_fraction) + sky);
   if (!is_glossy) { return radiance; }
-  let highlight = 0.22 * pow(max(dot(normal, normalize(uniforms.key.xyz + eye)), 0.0), 60.0);
-  let rim = 0.45 * pow(1.0 - clamp(dot(normal, eye), 0.0, 1.0), 5.0);
+  let highlight = HIGHLIGHT
+    * pow(max(dot(normal, normalize(uniforms.key.xyz + eye)), 0.0), HIGHLIGHT_EXPONENT);
+  let rim = RIM * pow(1.0 - clamp(dot(normal, eye), 0.0, 1.0), 5.0);
   return radiance + KEY_IRRADIANCE * (highlight * wrapped * key_fraction) + sky * rim;
 }
 
@@ -235,16 +227,14 @@ fn floor_light_at(position: vec3f) -> vec2f {
   return sum;
 }
 
-// A polynomial close to the color map of this name.
+// A polynomial close to the color map of this name. VIRIDIS has its coefficients, the lowest degree
+// first.
 fn viridis(value: f32) -> vec3f {
   let x = clamp(value, 0.0, 1.0);
-  var color = vec3f(-5.4321, 4.6416, 26.2721);
-  color = color * x + vec3f(4.7518, -13.7494, -65.3210);
-  color = color * x + vec3f(6.2037, 14.1540, 56.6563);
-  color = color * x + vec3f(-4.5999, -5.7582, -19.2918);
-  color = color * x + vec3f(-0.3272, 0.2148, 0.0920);
-  color = color * x + vec3f(0.1077, 1.3965, 1.3868);
-  return clamp(color * x + vec3f(0.2745, 0.0058, 0.3327), vec3f(0.0), vec3f(1.0));
+  var coefficients = VIRIDIS;
+  var color = vec3f(0.0);
+  for (var k = VIRIDIS_DEGREE; k >= 0; k--) { color = color * x + coefficients[k]; }
+  return clamp(color, vec3f(0.0), vec3f(1.0));
 }
 
 // The color of a hit: the radiance in shaded pictures, sRGB in others. w: 0 where there is no hit.
@@ -253,15 +243,15 @@ fn hit_color(pixel: u32) -> vec4f {
   let kind = hit_kind(info);
   if (uniforms.mode == MODE_EVALUATIONS) {
     let x = (log2(f32(info >> 14u) + 1.0) - uniforms.scale.x) * uniforms.scale.y;
-    return vec4f(select(viridis(x), vec3f(1.0, 0.0, 1.0), kind == KIND_OUT_OF_STEPS), 1.0);
+    return vec4f(select(viridis(x), OUT_OF_STEPS_COLOR, kind == KIND_OUT_OF_STEPS), 1.0);
   }
-  if (kind == KIND_OUT_OF_STEPS) { return vec4f(1.0, 0.0, 1.0, 1.0); }
+  if (kind == KIND_OUT_OF_STEPS) { return vec4f(OUT_OF_STEPS_COLOR, 1.0); }
   if (kind == KIND_NONE) { return vec4f(0.0); }
   if (uniforms.mode == MODE_NORMAL) { return vec4f(0.5 + 0.5 * hit_normal(pixel), 1.0); }
-  if (uniforms.mode == MODE_STATUS) { return vec4f(0.93, 0.93, 0.90, 1.0); }
+  if (uniforms.mode == MODE_STATUS) { return vec4f(HIT_COLOR, 1.0); }
   if (uniforms.mode == MODE_DEPTH) {
     let x = (hit_t(pixel) - uniforms.scale.x) * uniforms.scale.y;
-    return vec4f(vec3f(mix(0.95, 0.12, clamp(x, 0.0, 1.0))), 1.0);
+    return vec4f(vec3f(mix(NEAR_GRAY, FAR_GRAY, clamp(x, 0.0, 1.0))), 1.0);
   }
   let direction = ray_direction(pixel);
   let normal = hit_normal_to_eye(pixel, direction);
@@ -322,11 +312,14 @@ fn full_screen_vertex(@builtin(vertex_index) k: u32) -> @builtin(position) vec4f
 }
 fn to_srgb(color: vec3f) -> vec3f {
   let x = clamp(color, vec3f(0.0), vec3f(1.0));
-  return select(1.055 * pow(x, vec3f(1.0 / 2.4)) - 0.055, 12.92 * x, x <= vec3f(0.0031308));
+  let power = (1.0 + SRGB_OFFSET) * pow(x, vec3f(1.0 / SRGB_GAMMA)) - SRGB_OFFSET;
+  return select(power, SRGB_SLOPE * x, x <= vec3f(SRGB_LINEAR_END));
 }
-// Compresses highlights: radiance above 0.8 approaches 1.
+// Compresses highlights: radiance above SHOULDER_START approaches 1.
+const SHOULDER_ROOM = 1.0 - SHOULDER_START;
 fn compress_highlights(radiance: vec3f) -> vec3f {
-  return select(1.0 - 0.2 * exp(-(radiance - 0.8) / 0.2), radiance, radiance <= vec3f(0.8));
+  let compressed = 1.0 - SHOULDER_ROOM * exp((SHOULDER_START - radiance) / SHOULDER_ROOM);
+  return select(radiance, compressed, radiance > vec3f(SHOULDER_START));
 }
 // The color of the picture at a position in pixels; interpolated along axes in which the picture has
 // fewer pixels than the canvas.
@@ -356,7 +349,7 @@ fn display(@builtin(position) position: vec4f) -> @location(0) vec4f {
   let direction = normalize(
     uniforms.forward.xyz + offset.x * uniforms.right.xyz - offset.y * uniforms.up.xyz);
   let upward = vec3f(0.0, 0.0, 1.0);
-  let vignette = 1.0 - 0.45 * pow(clamp(direction.z, 0.0, 1.0), 0.7);
+  let vignette = 1.0 - WALL_DARKENING * pow(clamp(direction.z, 0.0, 1.0), WALL_EXPONENT);
   let wall = shaded_color(uniforms.ground.rgb, upward, upward, false, 1.0, 1.0) * vignette;
   let radiance = compress_highlights(color.rgb / max(color.a, 1e-6));
   return vec4f(to_srgb(color.a * radiance + (1.0 - color.a) * wall), 1.0);

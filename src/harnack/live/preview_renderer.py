@@ -19,16 +19,18 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import to_numpy
-from harnack.live.legend_data import FAR_GRAY, HIT_COLOR, NEAR_GRAY, evaluations_share
+from harnack.live.legend_data import FAR_GRAY, NEAR_GRAY, evaluations_share
 from harnack.live.live_scene import color_index
-from harnack.rendering.backdrops import FLOOR_HEIGHT, reflectance_of
-from harnack.rendering.images import SHOULDER_START, linear_to_srgb, to_uint8
+from harnack.rendering.aov_render import AOV_BACKGROUNDS, STATUS_COLORS
+from harnack.rendering.backdrops import FLOOR_HEIGHT, FLOOR_RADIUS, reflectance_of
+from harnack.rendering.images import compress_highlights, linear_to_srgb, to_uint8
 from harnack.rendering.integrator import OUT_OF_STEPS_COLOR
 from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.mitsuba_plugins import register
 from harnack.rendering.scales import viridis
 from harnack.rendering.shaded_render import ambient_visibility
-from harnack.rendering.shading import FloorShadow, StudioLight
+from harnack.rendering.shading import FloorShadow, StudioLight, wall_brightness
+from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -37,9 +39,6 @@ if TYPE_CHECKING:
 __all__ = ["CameraAxes", "Pixels", "Preview", "PreviewRenderer", "PreviewSurface"]
 
 Pixels = npt.NDArray[np.uint8]
-_BEHIND = {"light": (0.90, 0.90, 0.89), "dark": (0.10, 0.10, 0.11)}
-# How much darker the wall behind the stage is straight above, as in `backdrop`.
-_DARKER = 0.45
 
 
 @dataclass(frozen=True)
@@ -88,6 +87,7 @@ class PreviewRenderer:
     same surfaces, camera and size."""
 
     floor: FloorShadow | None = None
+    # Of the last picture alone, as hits take much memory.
     _hit_cache: tuple[Any, dict[str, Any]] | None = None
 
     def paint(
@@ -124,7 +124,7 @@ class PreviewRenderer:
             dr.eval(self._hit_cache[1])
         hits = self._hit_cache[1]
         if show != "shaded":
-            return _aov_preview(hits, show, _BEHIND[ground], size)
+            return _aov_preview(hits, show, AOV_BACKGROUNDS[ground], size)
         # The shadow is computed first: it evaluates arrays, and whatever was recorded before
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
@@ -149,17 +149,10 @@ class PreviewRenderer:
         floor_color, z = _vector(mi, reflectance, mi.Color3f), mi.Vector3f(0, 0, 1)
         # The wall has the color of the floor far away, and is darker higher up.
         wall = light.shade(floor_color, z, z, mi.Bool(False), mi.Float(1))
-        wall = wall * (1 - _DARKER * dr.power(dr.clip(hits["d"].z, 0, 1), 0.7))
-        # Tone mapping and the transfer function of sRGB, as in `images.tone_map`.
-        headroom = 1 - SHOULDER_START
-        compressed = 1 - headroom * dr.exp((SHOULDER_START - light_at_hits) / headroom)
-        linear = dr.select(
-            hits["met"], dr.select(light_at_hits > SHOULDER_START, compressed, light_at_hits), wall
-        )
+        wall = wall * wall_brightness(dr.clip(hits["d"].z, 0, 1))
+        linear = dr.select(hits["met"], compress_highlights(light_at_hits, dr.select, dr.exp), wall)
         linear = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), linear), 0, 1)
-        srgb = dr.select(
-            linear <= 0.0031308, 12.92 * linear, 1.055 * dr.power(linear, 1 / 2.4) - 0.055
-        )
+        srgb = linear_to_srgb(linear, dr.select)
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
         return Preview(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
@@ -198,8 +191,7 @@ class PreviewRenderer:
         if has_floor:
             # Rays that do not go down are left out by `ground`; for them, the divisor is not 0.
             t_floor = (FLOOR_HEIGHT - origin.z) / dr.minimum(d.z, -1e-9)
-            # The floor is a disc of radius 100.
-            ground = (d.z < 0) & (dr.norm(origin + t_floor * d) < 100.0)
+            ground = (d.z < 0) & (dr.norm(origin + t_floor * d) < FLOOR_RADIUS)
             t = dr.select(ground, t_floor, t)
         evaluations = mi.UInt32(0)
         for surface in painted:
@@ -303,7 +295,7 @@ def _aov_preview(
     elif show == "evaluations":
         picture[:] = viridis(evaluations_share(to_numpy(hits["evaluations"])))
     elif show == "status":
-        picture[met] = HIT_COLOR
+        picture[met] = STATUS_COLORS[RayStatus.HIT]
     # Rays out of steps are magenta in all pictures.
     picture[lost] = linear_to_srgb(np.array(OUT_OF_STEPS_COLOR))
     opaque = np.column_stack([picture, np.ones(len(picture))])

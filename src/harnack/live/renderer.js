@@ -5,11 +5,10 @@
 
 import { Camera } from "./camera.js";
 import { describeDisagreement } from "./device_check.js";
-import {
-  FLOOR_CELLS, FLOOR_RAYS, RAYS_PER_CELL, SAMPLE_BLOCK, floorLight, lightDirections,
-} from "./floor_light.js";
+import { floorLight, lightDirections } from "./floor_light.js";
 
 /** @import {Pose} from "./camera.js" */
+/** @import {Shading} from "./floor_light.js" */
 /** @import {Legend} from "./legend.js" */
 /** Rays with known answers, as words in text.
  *  @typedef {{lanes: string, results: string, count: number}} Check */
@@ -22,7 +21,7 @@ import {
 /** @typedef {{name: string, low: number, high: number, start: number, step: number | null}} Slider */
 /** @typedef {{
  *   title: string, placement: number[], camera: Pose, floor: number, show: string,
- *   ground: number[], sliders: Slider[], editable: boolean, middle: number[], reach: number,
+ *   ground: string, shading: Shading, sliders: Slider[], editable: boolean, middle: number[], reach: number,
  *   materials: string[], material: string | null, tube: number | null,
  *   legends: Record<string, Legend>, evaluations_top: number, state: State
  * }} Scene */
@@ -83,7 +82,8 @@ export class WebGpuRenderer {
     this.canvas = canvas;
     this.passes = passes;
     this.camera = new Camera(scene.camera);
-    this.groundReflectance = scene.ground;
+    /** The name of the ground. */
+    this.ground = scene.ground;
     this.mode = "shaded";
     /** The least and the greatest visible depth, once it is known.
      *  @type {[number, number] | null} */
@@ -121,9 +121,12 @@ export class WebGpuRenderer {
     this.uniforms = this.createBuffer(UNIFORM_BYTES, UNIFORM);
     this.lanes = this.createBuffer(28 * MAX_TILE_RAYS, STORAGE);
     this.results = this.createBuffer(28 * MAX_TILE_RAYS, STORAGE | COPY_SRC);
-    this.lightDirections = this.createBuffer(32 * SAMPLE_BLOCK * SAMPLE_BLOCK * RAYS_PER_CELL, STORAGE);
-    this.occluded = this.createBuffer(8 * FLOOR_RAYS, STORAGE | COPY_SRC);
-    this.floorLight = this.createBuffer(new Float32Array(2 * FLOOR_CELLS * FLOOR_CELLS).fill(1), STORAGE);
+    const { floor_cells: cells, rays_per_cell: rays, sky_directions: toSky } = scene.shading;
+    /** The number of rays from the floor to the key light, and to the sky. */
+    this.floorRays = cells * cells * rays;
+    this.lightDirections = this.createBuffer(32 * toSky.length, STORAGE);
+    this.occluded = this.createBuffer(8 * this.floorRays, STORAGE | COPY_SRC);
+    this.floorLight = this.createBuffer(new Float32Array(2 * cells * cells).fill(1), STORAGE);
     this.surfaceColors = this.createBuffer(32 * MAX_SURFACE_COLORS, STORAGE);
     this.maxPixels = Math.floor(device.limits.maxStorageBufferBindingSize / HIT_BYTES);
     this.reservePixels(1024);
@@ -292,18 +295,17 @@ export class WebGpuRenderer {
   /** The uniforms of a pass: `PassUniforms` in passes.wgsl. @param {PassOptions} options */
   passUniforms(options) {
     const { width, height, first = 0, count = 0, jitter = [0.5, 0.5], weight = 1 } = options;
-    const { directions = 16, rotation = 0.5, kind = 0 } = options;
-    const { floor } = this.scene;
+    const { floor, shading } = this.scene;
+    const { directions = shading.sky_direction_count, rotation = 0.5, kind = 0 } = options;
     const { position, axes } = this.camera;
     const [low, high] = this.mode === "evaluations"
       ? [0, Math.log2(1 + this.scene.evaluations_top)] : this.depthRange ?? [0, 1];
-    const isDark = this.groundReflectance[0] < 0.3;
     const hasFloor = position[2] > floor ? 1 : 0;
     const uniforms = new ArrayBuffer(UNIFORM_BYTES);
     new Float32Array(uniforms).set([
       ...position, directions, ...axes.right, this.camera.pixelSize(width, height), ...axes.up, rotation,
-      ...axes.forward, Infinity, ...this.keyLightDirection(), floor, ...this.groundReflectance, hasFloor,
-      low, 1 / (high - low), 0, 0, ...(isDark ? [0.10, 0.10, 0.11] : [0.90, 0.90, 0.89]), 1,
+      ...axes.forward, Infinity, ...this.keyLightDirection(), floor, ...shading.reflectance[this.ground], hasFloor,
+      low, 1 / (high - low), 0, 0, ...shading.background[this.ground], 1,
       this.canvas.width, this.canvas.height, ...jitter,
     ]);
     new Uint32Array(uniforms, 144).set([width, height, first, count]);
@@ -315,8 +317,8 @@ export class WebGpuRenderer {
   /** The unit vector to the key light, which moves with the camera: `StudioLight.of`. */
   keyLightDirection() {
     const { right, up, forward } = this.camera.axes;
-    const length = Math.hypot(0.52, 0.62, 0.59);
-    return right.map((r, k) => (-0.52 * r + 0.62 * up[k] - 0.59 * forward[k]) / length);
+    const [toRight, toUp, toBack] = this.scene.shading.key_direction;
+    return right.map((r, k) => toRight * r + toUp * up[k] - toBack * forward[k]);
   }
 
   /** Traces a picture, tile by tile. Returns whether it was completed, and not given up for another
@@ -387,19 +389,19 @@ export class WebGpuRenderer {
   /** Computes the light on the floor. Returns whether it was completed, and not given up for
    *  another picture. @param {number} generation */
   async lightFloor(generation) {
-    const { queue } = this.device;
-    queue.writeBuffer(this.lightDirections, 0, lightDirections(this.keyLightDirection()));
-    queue.writeBuffer(this.occluded, 0, new Uint32Array(2 * FLOOR_RAYS));
+    const { floorRays, device: { queue }, scene: { shading } } = this;
+    queue.writeBuffer(this.lightDirections, 0, lightDirections(shading, this.keyLightDirection()));
+    queue.writeBuffer(this.occluded, 0, new Uint32Array(2 * floorRays));
     for (const kind of [0, 1])
-      for (let first = 0; first < FLOOR_RAYS; ) {
-        const count = Math.min(this.tileRays, FLOOR_RAYS - first);
+      for (let first = 0; first < floorRays; ) {
+        const count = Math.min(this.tileRays, floorRays - first);
         this.submitFloorRays({ width: 1, height: 1, first, count, kind }, count);
         await queue.onSubmittedWorkDone();
         if (generation !== this.generation) return false;
         first += count;
       }
-    const occluded = await this.readBuffer(this.occluded, 8 * FLOOR_RAYS);
-    queue.writeBuffer(this.floorLight, 0, floorLight(occluded));
+    const occluded = await this.readBuffer(this.occluded, 8 * floorRays);
+    queue.writeBuffer(this.floorLight, 0, floorLight(shading, occluded));
     return true;
   }
 
@@ -522,7 +524,7 @@ export class WebGpuRenderer {
       this.isAbortable = true;
       const jitter = [(0.5 + k * 0.7548776662) % 1, (0.5 + k * 0.5698402910) % 1];
       const options = { width, height, jitter, weight: 1 / (k + 1),
-                        directions: k ? 4 : 16, rotation: (0.5 + 0.381966 * k) % 1 };
+                        directions: k ? 4 : undefined, rotation: (0.5 + 0.381966 * k) % 1 };
       const start = performance.now();
       if (!await this.trace(options, generation)) return false;
       this.pixelsPerMillisecond = (width * height) / (performance.now() - start);

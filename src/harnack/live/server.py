@@ -20,6 +20,7 @@ from harnack.live.page_file import check_title, document, still_png
 from harnack.live.scene_file import FieldSources, check_sources
 from harnack.live.session import MessageHandler, RequestError
 from harnack.live.sliders import extreme_slider_values
+from harnack.optional_packages import import_optional
 from harnack.rendering.option_table import shows_options
 
 if TYPE_CHECKING:
@@ -207,12 +208,9 @@ class _PageServer:
             OSError: the address cannot be served at.
             ModuleNotFoundError: the package aiohttp is not installed.
         """
-        try:
-            from aiohttp import web
-        except ImportError:
-            raise ModuleNotFoundError(
-                "a view is served by the package aiohttp: pip install 'harnack[view]'"
-            ) from None
+        web = import_optional(
+            "aiohttp.web", "a view is served by the package aiohttp: pip install 'harnack[view]'"
+        )
         loop = asyncio.new_event_loop()
         application = web.Application(client_max_size=_LONGEST)
         application.router.add_get("/", self._serve_page)

@@ -35,6 +35,7 @@ from harnack.live.preview_renderer import CameraAxes, PreviewRenderer, PreviewSu
 from harnack.live.scene_file import parse_scene
 from harnack.live.sliders import extreme_slider_values
 from harnack.name_suggestions import did_you_mean
+from harnack.progress import Progress, ProgressFunction
 from harnack.rendering import Camera
 from harnack.rendering.backdrops import GROUNDS
 from harnack.rendering.render_options import check_image_size
@@ -59,11 +60,8 @@ _PROGRESS_INTERVAL = 0.1
 _LARGEST_PICTURE = 8192
 
 
-Progress = Callable[[float], None]
-
-
-def _ignore_progress(part: float) -> None:
-    """Ignore the finished part of some work."""
+def _ignore_progress(progress: Progress) -> None:
+    """Ignore how far some work is."""
 
 
 class RequestError(ValueError):
@@ -77,7 +75,7 @@ class Cancelled(Exception):
 @dataclass
 class _PreviewCache:
     """The surfaces of one state of the controls, prepared for previews (quick pictures that Python
-    draws).
+    draws). Only that of the last state is kept: a person rarely returns to an earlier one.
 
     key: the state of the controls, as a tuple that can be compared.
     drawn: the surfaces as objects of the studio.
@@ -134,26 +132,25 @@ class MessageHandler:
 
         send: called with messages about the progress of long work.
         """
-        number, done, last = question["id"], 0.0, time.monotonic()
+        number, last = question["id"], time.monotonic()
 
-        def report(part: float) -> None:
-            """Note that a fraction `part` of the work was finished, and send the progress from time
-            to time.
+        def report(progress: Progress) -> None:
+            """Send the progress from time to time.
 
             Raises:
                 Cancelled: the client cancelled the question `number` or is gone.
             """
-            nonlocal done, last
+            nonlocal last
             if self.is_gone or number in self._cancelled:
                 raise Cancelled("stopped, as asked")
-            done, now = done + part, time.monotonic()
+            now = time.monotonic()
             if now > last + _PROGRESS_INTERVAL:
                 last = now
-                send({"id": number, "done": done})
+                send({"id": number, "done": progress.done})
 
         try:
             # A question that was cancelled while it waited is not begun.
-            report(0.0)
+            report(Progress())
             answer = self.session.answer(question, report)
         except Exception as wrong:
             kind = "" if isinstance(wrong, Cancelled) else f"{type(wrong).__name__}: "
@@ -178,7 +175,7 @@ class Session:
         self._painted: _PreviewCache | None = None
 
     def answer(
-        self, question: Mapping[str, Any], report: Progress = _ignore_progress
+        self, question: Mapping[str, Any], report: ProgressFunction = _ignore_progress
     ) -> JsonDict | Preview:
         """Answer a question. Returns JSON data, or a picture for the kind "draw".
 
@@ -255,7 +252,7 @@ class Session:
         return loops
 
     def _delta_response(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> JsonDict:
         """Answer "change": compute the data of all surfaces for the controls. Returns how it
         differs from the data at the start, as JSON data."""
@@ -264,7 +261,7 @@ class Session:
         return encode_arrays(state_delta(self.live.initial_state, state, checks=checks))
 
     def _probe(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> JsonDict:
         """Answer "probe": trace one ray, given in the surfaces' coordinates. Returns its nearest
         hit as JSON data: status, position, normal, value and curvatures, and "steps", the distances
@@ -325,7 +322,7 @@ class Session:
         }
 
     def _preview_response(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> Preview:
         """Answer "draw": return a preview with one ray per pixel, from the camera "eye" of the
         question."""
@@ -383,7 +380,7 @@ class Session:
         return state.prepared
 
     def _picture_response(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> JsonDict:
         """Answer "picture": draw by `render` from the camera of the question. Returns {"png":
         base64 text of a PNG file}."""
@@ -404,7 +401,7 @@ class Session:
         return Camera(position=tuple(eye.tolist()), target=tuple(target.tolist()), fov=fov)
 
     def _save(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> JsonDict:
         """Answer "save": return {"text": the scene file of the state, "lost": names of the sliders
         that it cannot hold}."""
@@ -415,7 +412,7 @@ class Session:
         return {"text": text, "lost": lost}
 
     def _load(
-        self, question: Mapping[str, Any], controls: ControlState, report: Progress
+        self, question: Mapping[str, Any], controls: ControlState, report: ProgressFunction
     ) -> JsonDict:
         """Answer "load": replace the scene by that of a scene file, whose text is in the question,
         and return the new scene's data as `LiveScene.scene` does. Of the settings of the file only

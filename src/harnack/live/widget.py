@@ -12,7 +12,7 @@ import anywidget
 import traitlets
 
 from harnack.live.live_scene import LIVE_MODES
-from harnack.live.page_file import MODULES, resource, script, still_png
+from harnack.live.page_file import MODULES, passes, resource, script, still_png
 from harnack.live.server import check_height
 from harnack.live.session import MessageHandler, RequestError, parse_camera
 
@@ -60,7 +60,7 @@ class Widget(anywidget.AnyWidget):
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="harnack-widget")
         scene = live.scene(title)
         super().__init__(
-            _scene=scene, _passes=resource("passes.wgsl"), height=height, show=live.show,
+            _scene=scene, _passes=passes(), height=height, show=live.show,
             _still=f"data:image/png;base64,{still_png(live)}", points=scene["state"]["curves"],
             sliders=dict(live.initial_controls.values), camera=live.pose,
         )  # fmt: skip

@@ -25,10 +25,10 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import check_manifold
+from harnack.meshing.closed_mesh import grown, to_manifold
 from harnack.meshing.components import winding_around
 from harnack.meshing.csg_meshing import apart_of
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
-from harnack.meshing.manifold_conversion import grown, to_manifold
 from harnack.meshing.meshing_errors import SelfIntersectionError
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh

@@ -1,206 +1,295 @@
-"""Closed meshes and their export to files in which they stay closed. Files hold single precision.
-So vertices are rounded to a grid for export: the points whose coordinates are multiples of a power
-of two, its spacing."""
+"""Closed meshes: their conversion to and from solids of the library manifold3d (class `Manifold`,
+which does Boolean operations), and other shapes as such solids."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
-from harnack.backend import BoolArray, FloatArray, IntArray
-from harnack.geometry.mesh_edges import has_distinct_corners, unique_with_inverse
-from harnack.meshing.checks import check_manifold
-from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
-from harnack.meshing.meshing_errors import (
-    LocalizedMeshingError,
-    MeshingError,
-    SelfIntersectionError,
-)
+from harnack.backend import FloatArray
+from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, VolumeIntersection
+from harnack.geometry.mesh_edges import row_dots
+from harnack.geometry.outline_loops import Outline, scale_for_clipper
+from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
-from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.triangle_mesh import TriangleMesh
 
-__all__ = ["ClosedMesh"]
+if TYPE_CHECKING:
+    from manifold3d import CrossSection, Manifold
 
-# Readers such as trimesh merge points that are nearer than 1e-8 in the file's unit.
-_MIN_STEP = 2.0**-26
-# Coordinates may be at most this large: divided by that distance, larger ones are beyond the
-# integers of readers.
-_LARGEST = 2.0**36
-# The size of a mesh has to be at least this many grid spacings.
-_MIN_STEPS_ACROSS = 1e4
-# If the rounded mesh does not pass its checks, the mesh is simplified, moving it by up to this many
-# grid spacings; the numbers are tried in turn.
-_SIMPLIFY_STEPS = (4, 32)
-# Where triangles cross, vertices are moved by up to this many grid spacings.
-_REPAIR_STEPS = 32
+    from harnack.fields.solids.mesh_solid import MeshSolid
+    from harnack.geometry import Volume
 
+__all__ = [
+    "box_manifold",
+    "extruded_manifold",
+    "from_manifold",
+    "grown",
+    "mesh_manifold",
+    "revolved_manifold",
+    "to_manifold",
+    "volume_manifold",
+    "without_short_edges",
+]
 
-class ClosedMesh(trimesh.Trimesh):
-    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or else raises a
-    MeshingError. The mesh in memory stays in double precision, unchanged. A mesh that is not closed
-    is written as trimesh writes it.
-
-    Files hold single precision, in which the ends of short edges coincide and slivers (thin
-    triangles) flip. So vertices are rounded to a grid that single precision holds, and edges
-    without a length are contracted. Then it is checked that the result is closed and does not
-    intersect itself. The mesh's repr is that of a trimesh.Trimesh, since it may be open.
-    """
-
-    def __repr__(self) -> str:
-        return super().__repr__().replace(type(self).__name__, "Trimesh")
-
-    @classmethod
-    def of(cls, mesh: trimesh.Trimesh) -> ClosedMesh:
-        """A copy of any mesh as a ClosedMesh."""
-        copied = trimesh.Trimesh.copy(mesh)
-        copied.__class__ = cls
-        return cast("ClosedMesh", copied)
-
-    def copy(self, *args: Any, **options: Any) -> trimesh.Trimesh:
-        """A copy of the mesh, as a ClosedMesh."""
-        copied = super().copy(*args, **options)
-        copied.__class__ = type(self)
-        return copied
-
-    def export(self, file_obj: Any = None, file_type: str | None = None, **options: Any) -> Any:
-        """Write the mesh to a file, with the parameters and the result of trimesh.Trimesh.export.
-        Metadata is not written: no file format holds its arrays.
-
-        Raises:
-            MeshingError: the mesh is closed, but would not be in the file: components touch, or the
-                mesh is too small or too far from the origin for single precision.
-        """
-        written = trimesh.Trimesh.copy(self)
-        written.metadata.clear()
-        if self.units is not None:
-            written.units = self.units
-        if self.is_watertight:
-            grid_spacing = _grid_spacing(np.asarray(self.vertices, np.float64))
-            written = _quantize(written, grid_spacing)
-            name = file_type or str(getattr(file_obj, "name", file_obj))
-            # Text files need as many decimals as 2^-k has to be exact.
-            if name.lower().endswith(("obj", "off")):
-                options.setdefault("digits", max(1, round(-math.log2(grid_spacing))))
-        return cast("Any", written).export(file_obj, file_type, **options)
+# The largest number of segments around a ball or a solid of revolution.
+_MAX_SEGMENTS = 2000
+# The area of a union may differ from the area of the solid's boundary by the first, relative to it.
+# Otherwise, and where triangles of the union cross, the faces of parts are moved outwards by the
+# second, relative to the size. At sharp corners vertices are moved by at most that divided by the
+# third.
+_AREA_TOLERANCE, _GROWTH, _MIN_COSINE = 1e-6, 1e-9, 0.1
+# The largest area of a twisted outline, in squares of the longest permitted edge.
+_MAX_CELLS = 1_000_000
 
 
-def _grid_spacing(x: FloatArray) -> float:
-    """The spacing of the grid to which vertices x (n, 3) are rounded for a file. It is a power of
-    two, and so large that single precision, which has 24 bits, holds all multiples of it up to the
-    largest coordinate.
+def to_manifold(surface: TriangleMesh) -> Manifold:
+    """Convert a closed mesh to the manifold3d solid that it bounds. The faces of the mesh run
+    counter-clockwise as seen from outside of the solid. A mesh without faces gives the empty solid.
 
     Raises:
-        MeshingError: the grid is too coarse for the size of the mesh, or coordinates are too large.
+        MeshingError: the mesh is not closed.
     """
-    largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
-    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
-    # `not <=` also refuses coordinates that are not numbers.
-    if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:
+    from manifold3d import Error, Manifold, Mesh64
+
+    if not len(surface.faces):
+        return Manifold()
+    vertices = np.ascontiguousarray(surface.vertices, np.float64)
+    body = Manifold(Mesh64(vertices, np.ascontiguousarray(surface.faces, np.uint64)))
+    if body.status() != Error.NoError:
         raise MeshingError(
-            f"the part is {size:.3g} long, at up to {largest:.3g} from the origin, where a file "
-            f"tells points apart that are {step:.2g} from each other, up to {_LARGEST:.2g}: move "
-            "it to the origin (apply_translation), or scale it (apply_scale), before it is written"
+            f"a surface of the solid is not closed ({body.status().name}): cells are too large for "
+            "it; choose a smaller `cell_size`"
         )
-    return step
+    return body
 
 
-def _quantize(mesh: trimesh.Trimesh, step: float) -> trimesh.Trimesh:
-    """Round the vertices of a closed mesh to the grid of spacing `step`, and return the rounded
-    mesh. If triangles cross after rounding, vertices near them are moved; if the mesh still does
-    not pass its checks, it is simplified first. A mesh with colors or textures is only rounded.
+def mesh_manifold(solid: MeshSolid) -> Manifold | None:
+    """Convert a `MeshSolid` to a manifold3d solid. If its mesh intersects itself, the result is the
+    union of the solids of the mesh's components, or None if a component intersects itself or is a
+    cavity.
+
+    Where components touch each other only up to rounding, their union may have gaps as thin as
+    rounding, whose walls add to the area, or triangles that cross. So if the area of the union
+    differs from the area of the solid's boundary, or if triangles of the union cross, the faces of
+    all components are first moved outwards by a tiny length. If triangles cross then too, the first
+    union of the right area is returned, or None if there is none.
 
     Raises:
-        MeshingError: nothing makes the rounded mesh closed and free of intersections.
+        MeshingError: more than two faces meet at an edge.
     """
-    original = TriangleMesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-    x, faces, is_kept = _merge_on_grid(original, step)
-    is_plain = not cast("Any", mesh.visual).defined
-    try:
-        mended = _resolve_after_rounding(
-            TriangleMesh(x, faces[is_kept]), original, _REPAIR_STEPS * step if is_plain else 0.0
+    from manifold3d import Error, Manifold, Mesh64, OpType
+
+    surface = solid.surface
+    # Copies, which can be written to; vertices are the input's, bit by bit.
+    body = Manifold(Mesh64(np.array(solid.vertices), np.array(surface.faces, np.uint64)))
+    if body.status() != Error.NoError:
+        raise MeshingError(
+            f"the faces of the mesh do not meet two by two at its edges ({body.status().name}): "
+            "join its parts by trimesh.boolean.union, or move them apart"
         )
-    except LocalizedMeshingError as error:
-        mended = _simplify_until_valid(original, step) if is_plain else None
-        if mended is None:
-            x, y, z = error.locations[0]
-            raise MeshingError(
-                f"in a file, where points are {step:.2g} from each other at the least, parts touch "
-                f"or pass through each other, such as near ({x:.4g}, {y:.4g}, {z:.4g}): move them "
-                "apart or make them overlap, or choose another `tolerance`"
-            ) from error
-    # Otherwise the rounded mesh can be used as it is.
-    if mended is not None:
-        return trimesh.Trimesh(mended.vertices, mended.faces, process=False, validate=False)
-    mesh.vertices, mesh.faces = x, faces
-    mesh.update_faces(is_kept)
-    mesh.remove_unreferenced_vertices()
-    return mesh
-
-
-def _simplify_until_valid(original: TriangleMesh, step: float) -> TriangleMesh | None:
-    """Simplify a closed mesh by manifold3d and round it to the grid of spacing `step`, so that no
-    triangles cross. Two strengths of simplification are tried; None if both fail, or if no triangle
-    is left."""
-    for steps in _SIMPLIFY_STEPS:
-        simpler = from_manifold(without_short_edges(to_manifold(original), steps * step))
-        x, faces, is_kept = _merge_on_grid(simpler, step)
-        if not is_kept.any():
+    # All triangles bound the solid: the mesh does not intersect itself.
+    if surface.boundary_triangles is None:
+        return body
+    parts = body.decompose()
+    for part in parts:
+        boundary = from_manifold(part)
+        if part.volume() <= 0 or len(intersecting_faces(boundary.vertices, boundary.faces)):
             return None
-        rounded = TriangleMesh.without_unused_vertices(x, faces[is_kept])
-        try:
-            return _resolve_after_rounding(rounded, original, _REPAIR_STEPS * step) or rounded
-        except LocalizedMeshingError:
-            continue
-    return None
+    first_union: Manifold | None = None
+    for length in (0.0, _GROWTH * surface.size):
+        union = Manifold.batch_boolean([_grown_part(part, length) for part in parts], OpType.Add)
+        if abs(union.surface_area() - surface.area) <= _AREA_TOLERANCE * surface.area:
+            first_union = first_union or union
+            boundary = from_manifold(union)
+            if not len(intersecting_faces(boundary.vertices, boundary.faces)):
+                return union
+    return first_union
 
 
-def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntArray, BoolArray]:
-    """Round the vertices of a surface to the grid of spacing `step`, and join vertices that
-    coincide.
-
-    Returns the rounded vertices (n, 3), coinciding ones included; the faces (m, 3), in which the
-    first of the vertices at each point stands for all of them; and a mask (m,) of the faces that
-    still have three different corners.
-    """
-    grid = np.round(surface.vertices / step)
-    x = grid * step
-    # group[i]: a number that vertices have in common if their coordinates so far, axis by axis, are
-    # equal.
-    group = np.zeros(len(x), np.int64)
-    for column in (grid - grid.min(axis=0)).astype(np.int64).T:
-        _, group, _, _ = unique_with_inverse(group * (int(column.max()) + 1) + column)
-    # Of repeated indices the last assignment stays, so in reverse order the first vertex.
-    first = np.empty(len(x), np.int64)
-    first[group[::-1]] = np.arange(len(x))[::-1]
-    faces = first[group][surface.faces]
-    return x, faces, has_distinct_corners(faces)
+def _grown_part(part: Manifold, length: float) -> Manifold:
+    """The solid `part` with its faces moved outwards by about `length`; `part` itself if the length
+    is 0."""
+    return part if length == 0 else to_manifold(grown(from_manifold(part), length))
 
 
-def _resolve_after_rounding(
-    rounded: TriangleMesh, original: TriangleMesh, length: float
-) -> TriangleMesh | None:
-    """Move vertices of a rounded surface near triangles that cross, by no more than `length`, until
-    no triangles cross; and return the result. None if the rounded surface can be used as it is: no
-    triangles cross; or they cannot be separated, but triangles of the original surface cross too,
-    as in some repaired meshes.
+def grown(surface: TriangleMesh, length: float) -> TriangleMesh:
+    """A closed surface with its vertices moved outwards along their normals, so far that faces move
+    by about `length`. Components that touched only up to rounding then overlap. A negative length
+    moves them inwards."""
+    import trimesh  # imported here: it takes half a second
+
+    x, faces = surface.vertices, surface.faces
+    mesh = trimesh.Trimesh(x, faces, process=False)
+    normals = np.array(mesh.vertex_normals)
+    # The smallest cosine between a vertex normal and the faces there: a move by length / cosine
+    # moves the face by the length.
+    cosine = np.ones(len(normals))
+    for k in range(3):
+        np.minimum.at(cosine, faces[:, k], row_dots(normals[faces[:, k]], mesh.face_normals))
+    return TriangleMesh(x + normals * (length / np.maximum(cosine, _MIN_COSINE))[:, None], faces)
+
+
+def without_short_edges(solid: Manifold, length: float) -> Manifold:
+    """Remove short edges and slivers (thin triangles) of a solid, which moves its surface by up to
+    `length`. If that changes the volume by more than 2 * length * area, the solid is returned as it
+    was: manifold3d may lose a part of a solid with slivers as thin as rounding."""
+    simpler = solid.simplify(length)
+    max_change = 2 * length * solid.surface_area()
+    return simpler if abs(simpler.volume() - solid.volume()) <= max_change else solid
+
+
+def from_manifold(manifold: Manifold) -> TriangleMesh:
+    """Convert the surface of a manifold3d solid to a triangle mesh."""
+    mesh = manifold.to_mesh64()
+    vertices = np.array(mesh.vert_properties, np.float64)[:, :3]
+    return TriangleMesh(vertices, np.array(mesh.tri_verts, np.int64))
+
+
+def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
+    """The box between the corners `lower` and `upper`, (3,) each, as a manifold3d solid."""
+    from manifold3d import Manifold
+
+    x, y, z = (float(v) for v in upper - lower)
+    a, b, c = (float(v) for v in lower)
+    return Manifold.cube((x, y, z)).translate((a, b, c))
+
+
+def extruded_manifold(
+    outline: Outline, height: float, twist: float, taper: float, tolerance: float
+) -> Manifold:
+    """A plane outline, extruded from z = 0 to z = height, as a manifold3d solid. The cross-section
+    at the upper end is the outline turned by `twist` degrees and scaled by the factor `taper`; in
+    between both change in proportion to z.
+
+    Without a twist the faces are flat, and exact. With a twist the vertices lie on the exact
+    surface, and faces are within `tolerance` (a length) of it. Proof. Take a triangle of the
+    straight extrusion with edges of at most L, and the map that turns and scales the extrusion. Let
+    M bound the second derivatives of the map along lines. The triangle lies in a ball of radius
+    L/sqrt(3), so that linear interpolation of the map between the corners errs by at most M/2 times
+    the square of that radius, M L^2/6. Let the map turn by the angle a (in radians) and change the
+    scale by k, both per unit of z, at distances up to R from the axis. Then M = q (a + a^2 R) + k
+    (1 + 2 a R), with q = max(1, taper).
 
     Raises:
-        LocalizedMeshingError: the rounded surface is not closed; or triangles still cross, although
-            no triangles of the original surface do.
+        MeshingError: the tolerance is so small that there are millions of faces.
     """
-    check_manifold(rounded.faces, rounded.vertices)
-    try:
-        apart = resolve_self_intersections(rounded, length)
-    except SelfIntersectionError:
-        if not len(intersecting_faces(original.vertices, original.faces)):
-            raise
-        return None
-    # The same object: nothing was moved.
-    if apart is rounded:
-        return None
-    check_manifold(apart.faces, apart.vertices)
-    return apart
+    section, scale = _cross_section(outline)
+    inverse_scale = (1 / scale, 1 / scale, 1 / scale)
+    if twist == 0:
+        return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(inverse_scale)
+    rate, growth = math.radians(twist) / height, (taper - 1.0) / height
+    radius = max(float(np.linalg.norm(loop, axis=1).max()) for loop in outline)
+    turn, q = abs(rate), max(1.0, taper)
+    second_derivative = q * (turn + turn**2 * radius) + abs(growth) * (1 + 2 * turn * radius)
+    # M L^2/6 = tolerance.
+    max_edge = math.sqrt(6 * tolerance / second_derivative)
+    straight = section.extrude(height * scale)
+    # The area in squares of the longest edge.
+    square_count = straight.surface_area() / (scale * max_edge) ** 2
+    if square_count > _MAX_CELLS:
+        raise MeshingError(
+            f"a twisted outline within {tolerance:.3g} has about {4 * square_count:,.0f} faces: "
+            "choose a larger `tolerance`"
+        )
+
+    def mapped(points: FloatArray) -> FloatArray:
+        """Turn and scale points (n, 3) of the straight extrusion in proportion to their height."""
+        z = points[:, 2] / scale
+        factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
+        x, y = factor * points[:, 0], factor * points[:, 1]
+        return np.column_stack([c * x - s * y, s * x + c * y, points[:, 2]])
+
+    return straight.refine_to_length(max_edge * scale).warp_batch(mapped).scale(inverse_scale)
+
+
+def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
+    """An outline in the (r, z) plane, revolved about the z axis, as a manifold3d solid. Vertices
+    lie on the exact surface, and faces are within `tolerance` (a length) of it. Proof. If a circle
+    of radius r is divided into n segments, a chord is at most r (1 - cos(pi/n)) <= r (pi/n)^2/2
+    from its arc.
+
+    Raises:
+        MeshingError: the tolerance is so small that there are too many segments.
+    """
+    radius = max(float(loop[:, 0].max()) for loop in outline)
+    # From r (pi/n)^2/2 <= tolerance, rounded up to a multiple of 4.
+    segments = 4 * math.ceil(0.25 * math.pi * math.sqrt(radius / (2 * tolerance)))
+    if segments > _MAX_SEGMENTS:
+        raise MeshingError(
+            f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
+            "segments around: choose a larger `tolerance`"
+        )
+    section, scale = _cross_section(outline)
+    return section.revolve(max(16, segments)).scale((1 / scale, 1 / scale, 1 / scale))
+
+
+def _cross_section(outline: Outline) -> tuple[CrossSection, float]:
+    """Returns two results: the manifold3d cross-section of an outline, scaled so that manifold3d
+    does not round its coordinates (`scale_for_clipper`); and the factor by which it was scaled."""
+    from manifold3d import CrossSection
+
+    loops, scale = scale_for_clipper(outline)
+    return CrossSection(loops), scale
+
+
+def volume_manifold(
+    volume: Volume, lower: FloatArray, upper: FloatArray, tolerance: float
+) -> Manifold:
+    """The part of a volume in the box from `lower` to `upper`, (3,) each, as a manifold3d solid.
+    Polytopes are exact; a ball becomes a polyhedron whose vertices lie on the sphere and whose
+    faces are within `tolerance` of it.
+
+    Raises:
+        MeshingError: the volume is neither a box, a ball, a half-space, a convex hull nor an
+            intersection of these; or a ball would have millions of faces.
+    """
+    from manifold3d import Manifold
+
+    manifold = box_manifold(lower, upper)
+    if isinstance(volume, VolumeIntersection):
+        for operand in volume.volumes:
+            manifold ^= volume_manifold(operand, lower, upper, tolerance)
+        return manifold
+    if isinstance(volume, Box):
+        low, high = (np.array(end, np.float64) for end in volume.bounds())
+        low, high = np.maximum(low, lower), np.minimum(high, upper)
+        return box_manifold(low, high) if (low < high).all() else Manifold()
+    if isinstance(volume, HalfSpace | ConvexHull):
+        for row in volume.planes():
+            x, y, z, h = (float(v) for v in row)
+            manifold = manifold.trim_by_plane((-x, -y, -z), -h)
+        return manifold
+    if isinstance(volume, Ball):
+        return manifold ^ _ball_manifold(volume, tolerance)
+    raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
+
+
+def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
+    """A ball as a manifold3d solid: a geodesic polyhedron whose vertices lie on the sphere and
+    whose faces are within `tolerance` (a length) of it.
+
+    Proof. Let n be the number of segments around, and r the radius. The octahedron's faces are
+    divided into equilateral triangles, whose vertices are then moved onto the sphere. A side of the
+    octahedron becomes n/4 edges along a quarter of a great circle; their mean length is (r
+    pi/2)/(n/4) = 2 pi r/n. All edges are at most sqrt(3) times as long. So the circle through the
+    corners of a triangle has a radius of at most c = edge/sqrt(3) <= 2 pi r/n, and the triangle is
+    at most c^2/(2 r) from the sphere.
+
+    Raises:
+        MeshingError: the tolerance is so small that there are millions of faces.
+    """
+    from manifold3d import Manifold
+
+    r = ball.radius
+    # From (2 pi r/n)^2/(2 r) <= tolerance, rounded up to a multiple of 4.
+    segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
+    if segments > _MAX_SEGMENTS:
+        raise MeshingError(
+            f"a ball of radius {r:g} within {tolerance:.3g} has {2 * segments**2:,} faces: choose "
+            "a larger `tolerance`"
+        )
+    x, y, z = ball.center
+    return Manifold.sphere(r, max(16, segments)).translate((x, y, z))

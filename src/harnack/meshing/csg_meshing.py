@@ -44,6 +44,16 @@ from harnack.geometry import Ball, Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import check_manifold
 from harnack.meshing.clipping import snap_to_box
+from harnack.meshing.closed_mesh import (
+    box_manifold,
+    extruded_manifold,
+    from_manifold,
+    mesh_manifold,
+    revolved_manifold,
+    to_manifold,
+    volume_manifold,
+    without_short_edges,
+)
 from harnack.meshing.components import drop_degenerate_components
 from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_operands, flatten_csg
 from harnack.meshing.lattice_meshing import (
@@ -54,19 +64,8 @@ from harnack.meshing.lattice_meshing import (
 )
 from harnack.meshing.level_function import (
     CELLS_PER_WAVE,
-    EvaluatorCache,
     LevelFunction,
     LevelSamples,
-)
-from harnack.meshing.manifold_conversion import (
-    box_manifold,
-    extruded_manifold,
-    from_manifold,
-    mesh_manifold,
-    revolved_manifold,
-    to_manifold,
-    volume_manifold,
-    without_short_edges,
 )
 from harnack.meshing.meshing_errors import (
     CELL_SIZE_RATIO,
@@ -82,6 +81,7 @@ from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.meshing.tube_mesh import tube_manifold
+from harnack.tracer.traced_surface import CallCache
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -174,7 +174,7 @@ class CsgMesher:
     evaluations: int = 0
     levels: int = 0
     smallest_cell: float = math.inf
-    uploads: EvaluatorCache = dataclasses.field(default_factory=EvaluatorCache)
+    uploads: CallCache = dataclasses.field(default_factory=CallCache)
     intersected_with: IntersectedOperands = ()
     irrelevant_region_cache: tuple[IntersectedOperands, IrrelevantRegion] | None = None
 
@@ -746,7 +746,7 @@ def mesh_solid(
     max_error = 0.5 * tolerance.at(size)
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
-    uploads = EvaluatorCache()
+    uploads = CallCache()
     first: MeshingError | None = None
     before: MeshingError | None = None
     while True:

@@ -19,8 +19,8 @@ from harnack.geometry.mesh_edges import (
     unit_normals,
 )
 from harnack.meshing.checks import euler_characteristic
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.triangle_mesh import TriangleMesh
@@ -113,7 +113,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
     Raises:
         MeshingError: the mesh must be closed, but is not, or has no positive volume.
     """
-    from harnack.meshing.closed_mesh import ClosedMesh
+    from harnack.meshing.closed_export import ClosedMesh
 
     mesh = ClosedMesh(surface.vertices, surface.faces, process=False, validate=False)
     pairs = half_edges(surface.faces)

@@ -21,12 +21,13 @@ from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.formula import without_alternatives
 from harnack.fields.solids.mesh_solid import share_samples
 from harnack.geometry.mesh_edges import row_norms
+from harnack.tracer.traced_surface import CallCache
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.fields import Field
 
-__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "EvaluatorCache", "LevelFunction", "LevelSamples"]
+__all__ = ["CELLS_PER_WAVE", "MOST_FACES", "LevelFunction", "LevelSamples"]
 
 MOST_FACES = 2_000_000
 """The largest number of triangles of a level set, unless another is chosen."""
@@ -77,27 +78,12 @@ class LevelSamples:
         return np.abs(self.value) / np.maximum(slope, 1e-300)
 
 
-class EvaluatorCache:
-    """A store of fields that were prepared for double precision (their data uploaded to the
-    backend), so that several level functions of the same field share one prepared field."""
-
-    def __init__(self) -> None:
-        self._made: dict[int, tuple[Field, Field]] = {}
-
-    def of(self, field: Field) -> Field:
-        """The field prepared for double precision. It is prepared at the first call, and the same
-        object is returned later."""
-        if id(field) not in self._made:  # it is stored, so that no other field has its id
-            self._made[id(field)] = field, field.prepare(choose_backend("double"))
-        return self._made[id(field)][1]
-
-
 @dataclass
 class LevelFunction:
     """The function f - level of a field f, evaluated in double precision at arrays of points.
 
     most_faces: the largest allowed number of triangles of the level set's mesh.
-    uploads: the store of prepared fields; several functions may share it.
+    uploads: holds fields prepared for double precision; several functions may share it.
     secant_steps: the number of secant steps that find the point at which an edge of a cell meets
         the level set, for functions that are nearly linear along edges, such as distances. With 0
         it is found by a search.
@@ -106,13 +92,15 @@ class LevelFunction:
     field: Field
     level: float
     most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
-    uploads: EvaluatorCache = dataclasses.field(default_factory=EvaluatorCache, kw_only=True)
+    uploads: CallCache = dataclasses.field(default_factory=CallCache, kw_only=True)
     secant_steps: int = dataclasses.field(default=0, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
-        self._prepared = self.uploads.of(self.field)
+        self._prepared = self.uploads.get_or_make(
+            self.field, "evaluator", lambda: self.field.prepare(self._backend)
+        )
         # Data, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)
         self._levels = Levels((level,), self.field.period)

@@ -79,7 +79,8 @@ class PointsOnLevel:
 
         tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
             points."""
-        mesh = function.field.jump_mesh()
+        jumps = function.field.jumps
+        mesh = None if jumps is None else jumps.mesh()
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
         field = function.field

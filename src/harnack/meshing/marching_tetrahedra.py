@@ -158,7 +158,7 @@ def count_crossings(
     (`LevelSamples.quarter_period_radius`). If the radii of both ends together are as long as the
     edge, the function changes by less than half a period along it. Then the change is the
     difference of the values, moved by whole periods into half a period around 0. Along other edges
-    the field integrates its change (`Field.continuous_change`).
+    the field integrates its change (`Boundary.continuous_change`).
 
     Raises:
         MeshingError: the field cannot integrate its change along an edge.
@@ -205,18 +205,19 @@ def _integrate_change(
         MeshingError: the field cannot integrate its change, or the result does not differ by whole
             periods.
     """
-    integrated = field.continuous_change(p, q)
-    if integrated is None:
+    boundary = field.boundary
+    if boundary is None or boundary.continuous_change is None:
         raise MeshingError(
             f"how {type(field).__name__} changes along {len(p)} edges of the mesh is not proved, "
-            "and it has no `change_along`: choose a smaller `cell_size`"
+            "and its boundary has no `continuous_change`: choose a smaller `cell_size`"
         )
+    integrated = boundary.continuous_change(p, q)
     # The integral only decides how many whole periods are added.
     periods = np.round((integrated - wrapped) / period)
     if np.abs(integrated - wrapped - period * periods).max(initial=0.0) > 1e-6:
         raise MeshingError(
-            f"{type(field).__name__}.change_along is not the difference of two values, modulo "
-            "the period"
+            f"{type(field).__name__}.boundary.continuous_change is not the difference of two "
+            "values, modulo the period"
         )
     return wrapped + period * periods
 

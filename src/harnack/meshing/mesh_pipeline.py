@@ -29,6 +29,7 @@ from harnack.meshing.checks import (
     check_no_self_intersection,
 )
 from harnack.meshing.clipping import clip_to_volume
+from harnack.meshing.closed_mesh import box_manifold, from_manifold, to_manifold, volume_manifold
 from harnack.meshing.components import largest_body, largest_component
 from harnack.meshing.csg_meshing import (
     AngleMesher,
@@ -41,12 +42,6 @@ from harnack.meshing.finishing import check_options, simplify_mesh, to_trimesh, 
 from harnack.meshing.lattice_meshing import mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
-from harnack.meshing.manifold_conversion import (
-    box_manifold,
-    from_manifold,
-    to_manifold,
-    volume_manifold,
-)
 from harnack.meshing.mesh_tolerance import MeshTolerance
 from harnack.meshing.meshing_errors import (
     CELL_SIZE_RATIO,
@@ -67,7 +62,7 @@ from harnack.meshing.sign_isosurface import (
 )
 from harnack.meshing.thickening import thicken
 from harnack.meshing.triangle_mesh import TriangleMesh
-from harnack.progress import teller
+from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer import Surface
 from harnack.tracer.surface import intersection_of
 from harnack.tracer.trace_options import SURFACE_OPTIONS, shows_keywords, surface_and_options
@@ -106,7 +101,7 @@ def mesh(
     simplify: bool = False,
     max_triangles: int = MOST_FACES,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
 ) -> trimesh.Trimesh:
@@ -152,7 +147,7 @@ def mesh(
     max_triangles: the largest number of triangles of one level set, before it is simplified. A mesh
         that would take more is not begun, or given up, with a MeshingError. It limits the number of
         cells too, as does a fixed limit of two million.
-    progress: a function that is told what is being done.
+    progress: whether to show what is being done, or a function that is called with a `Progress`.
     options: a `TraceOptions`. Meshes use only its tolerance: the largest distance of triangles from
         the surface, which is sampled and not proved; None for 1e-3 of the longest side of the level
         set's box.
@@ -217,55 +212,55 @@ def mesh(
     accuracy = MeshTolerance.of(trace_choices)
     check_options(cell_size, thickness, seed, max_triangles)
     simplify, largest = flag(simplify, "simplify"), target.largest > 0
-    report = teller(progress)
     field, level, solid = _checked(target.field), *_level_and_solid(target, thickness)
     is_closed = bool(solid) or thickness is not None
     if simplify and not is_closed:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
-    asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, report)
-    # Three ways of meshing, by the kind of the field.
-    if uses_sign_meshing(field):
-        made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
-    elif solid:
-        made = _mesh_solid(field, level, solid, asked)
-    else:
-        made = _mesh_level_set(field, level, asked)
-    triangles, facts = made.surface, dict(made.facts)
-    if solid:
-        facts["side"] = target.side or "below"
-    else:
-        # Of a level set, `largest` keeps the component with the largest area, before it is
-        # thickened.
-        triangles = largest_component(triangles) if largest else triangles
-        made.check_level(triangles)
-    tolerance = accuracy.at(made.size)
-    if thickness is not None:
-        report("thickening")
-        normals = vertex_normals(made.function, triangles)
-        # Half of the tolerance is left for the simplification.
-        triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-        facts |= more_facts
-    if largest and is_closed:
-        triangles = largest_body(triangles)
-
-    def check(surface: TriangleMesh) -> None:
-        """Raise a MeshingError unless the mesh `surface`, which was changed, is still a manifold
-        and, for a solid, within the tolerance of the level set."""
+    with show_progress("mesh", progress) as reporter:
+        asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, reporter.tell)
+        # Three ways of meshing, by the kind of the field.
+        if uses_sign_meshing(field):
+            made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
+        elif solid:
+            made = _mesh_solid(field, level, solid, asked)
+        else:
+            made = _mesh_level_set(field, level, asked)
+        triangles, facts = made.surface, dict(made.facts)
         if solid:
-            made.check_level(surface)
-        check_manifold(surface.faces)
+            facts["side"] = target.side or "below"
+        else:
+            # Of a level set, `largest` keeps the component with the largest area, before it is
+            # thickened.
+            triangles = largest_component(triangles) if largest else triangles
+            made.check_level(triangles)
+        tolerance = accuracy.at(made.size)
+        if thickness is not None:
+            asked.report("thickening")
+            normals = vertex_normals(made.function, triangles)
+            # Half of the tolerance is left for the simplification.
+            triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+            facts |= more_facts
+        if largest and is_closed:
+            triangles = largest_body(triangles)
 
-    # Meshes that are not known to be valid are checked here.
-    if not made.is_checked:
-        report("checking")
-        check(triangles)
-        check_no_self_intersection(triangles.vertices, triangles.faces)
-    if simplify:
-        report("simplifying")
-        triangles, more_facts = simplify_mesh(triangles, tolerance, check)
-        facts |= more_facts
-    return to_trimesh(triangles, facts, is_closed)
+        def check(surface: TriangleMesh) -> None:
+            """Raise a MeshingError unless the mesh `surface`, which was changed, is still a
+            manifold and, for a solid, within the tolerance of the level set."""
+            if solid:
+                made.check_level(surface)
+            check_manifold(surface.faces)
+
+        # Meshes that are not known to be valid are checked here.
+        if not made.is_checked:
+            asked.report("checking")
+            check(triangles)
+            check_no_self_intersection(triangles.vertices, triangles.faces)
+        if simplify:
+            asked.report("simplifying")
+            triangles, more_facts = simplify_mesh(triangles, tolerance, check)
+            facts |= more_facts
+        return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
@@ -334,7 +329,7 @@ def _mesh_from_signs(
     """
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
-    if isinstance(field, WindingNumber) and field.is_of_sheets_alone(levels):
+    if isinstance(field, WindingNumber) and field.is_whole_surface(levels):
         return _faces_alone(field, levels[0], solid, asked)
     volume, box = asked.volume, _box(field, levels, asked.volume)
     size = float((box.upper - box.lower).max())
@@ -397,7 +392,7 @@ def _mesh_from_signs(
             solid_so_far = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
             solid_so_far = solid_so_far - to_manifold(signed(ends[1], -1.0, True))
-        if field.has_jumps and len(levels) == 2:
+        if field.jumps is not None and len(levels) == 2:
             _check_has_thickness(field, solid_so_far, ends, asked.tolerance.at(size))
         cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         solid_so_far ^= volume_manifold(
@@ -433,7 +428,7 @@ def _ends_by_signs(
         TypeError: the level set is to be thickened, but f jumps across it.
         ValueError: the field has no such level.
     """
-    if is_thick and field.has_jumps:
+    if is_thick and field.jumps is not None:
         raise TypeError(
             f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
             "along: mesh it, and move the mesh's vertices instead"
@@ -628,7 +623,7 @@ def _checked(field: Field) -> Field:
             `SolidAngle`.
     """
     check_is_field(field)
-    if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
+    if field.patches is not None or (field.jumps is not None and not uses_sign_meshing(field)):
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"

@@ -56,7 +56,7 @@ from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.name_suggestions import is_one_of
-from harnack.progress import teller
+from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer.trace_options import trace_options
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def repair(
     largest: bool = False,
     cell_size: float | None = None,
     seed: int = 0,
-    progress: Callable[[str], None] | None = None,
+    progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     tolerance: float | None = None,
 ) -> trimesh.Trimesh:
@@ -134,7 +134,7 @@ def repair(
     largest: whether to keep only the body of the largest volume, with its cavities.
     cell_size: the size of cells before refinement, in the mesh's unit; None chooses it.
     seed: of the small random moves that keep points in general position.
-    progress: a function that is told what is being done.
+    progress: whether to show what is being done, or a function that is called with a `Progress`.
     options: a `TraceOptions`. Repairs use only its tolerance: the largest distance of harmonic
         fillings and of remeshed triangles from the surface w = 1/2, a length, which is sampled and
         not proved. None is 1e-3 of the longest side of the box around the mesh or, for fillings, of
@@ -193,46 +193,49 @@ def repair(
     largest = flag(largest, "largest")
     keywords = {} if tolerance is None else {"tolerance": tolerance}
     accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
-    settings = _checked_settings(keep, filling, accuracy, cell_size, seed, teller(progress))
-    _check_is_mesh(mesh)
-    _check_encloses(mesh)
-    intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
-    stages = {
-        "all": _fill_only,
-        "boolean_union": _unite_bodies,
-        "valid": _keep_valid,
-        "welded": _weld_loose,
-        "none": _remesh,
-    }
-    names = list(stages) if keep is None else [keep]
-    reasons, results = list[str](), list[_Result]()
-    for name in names:
-        try:
-            surface, facts = stages[name](intended, settings)
-        except (MeshError, MeshingError) as error:
-            if name == names[-1] and not results:
-                raise
-            reasons.append(str(error))
-            settings.report(f"{error}; so not all is kept")
-            continue
-        settings.report("comparing with what was given")
-        away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
-        results.append(_Result(surface, facts, intended.difference(surface, away)))
-        if results[-1].difference is None:
-            break
-        reasons.append(f"the result of {facts['stage']} is another solid: {results[-1].difference}")
-        settings.report(f"{reasons[-1]}; so another way")
-    best = min(results, key=lambda result: result.badness)
-    moved = best.facts.get("moved", 0.0)
-    if moved > 2 * accuracy.at(intended.size):
-        warnings.warn(
-            f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
-            "repaired mesh may be off by as much",
-            stacklevel=2,
-        )
-    # Each reason once.
-    why = "; ".join(dict.fromkeys(reasons)) or None
-    return best.finished({"why": why, "welded": intended.rounded}, largest)
+    with show_progress("repair", progress) as reporter:
+        settings = _checked_settings(keep, filling, accuracy, cell_size, seed, reporter.tell)
+        _check_is_mesh(mesh)
+        _check_encloses(mesh)
+        intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
+        stages = {
+            "all": _fill_only,
+            "boolean_union": _unite_bodies,
+            "valid": _keep_valid,
+            "welded": _weld_loose,
+            "none": _remesh,
+        }
+        names = list(stages) if keep is None else [keep]
+        reasons, results = list[str](), list[_Result]()
+        for name in names:
+            try:
+                surface, facts = stages[name](intended, settings)
+            except (MeshError, MeshingError) as error:
+                if name == names[-1] and not results:
+                    raise
+                reasons.append(str(error))
+                settings.report(f"{error}; so not all is kept")
+                continue
+            settings.report("comparing with what was given")
+            away = 2 * accuracy.at(intended.size) + facts.get("moved", 0.0)
+            results.append(_Result(surface, facts, intended.difference(surface, away)))
+            if results[-1].difference is None:
+                break
+            reasons.append(
+                f"the result of {facts['stage']} is another solid: {results[-1].difference}"
+            )
+            settings.report(f"{reasons[-1]}; so another way")
+        best = min(results, key=lambda result: result.badness)
+        moved = best.facts.get("moved", 0.0)
+        if moved > 2 * accuracy.at(intended.size):
+            warnings.warn(
+                f"faces that were apart were joined, which moved corners by up to {moved:.3g}: the "
+                "repaired mesh may be off by as much",
+                stacklevel=2,
+            )
+        # Each reason once.
+        why = "; ".join(dict.fromkeys(reasons)) or None
+        return best.finished({"why": why, "welded": intended.rounded}, largest)
 
 
 @dataclass(frozen=True)
@@ -299,7 +302,7 @@ class _Result:
 
         more: entries that are added to `metadata["harnack"]`.
         largest: whether to keep only the body with the largest volume."""
-        from harnack.meshing.closed_mesh import ClosedMesh
+        from harnack.meshing.closed_export import ClosedMesh
 
         surface = self.surface
         facts: dict[str, Any] = {**self.facts, **more, "differs": None}

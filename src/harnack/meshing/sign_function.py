@@ -164,7 +164,7 @@ class SignFunction(LevelFunction):
         gradients are set to 0, since they tell nothing about the distance to the level set. Radii
         (`quarter_period_radius`) are 0."""
         no_radius = np.zeros(len(points))
-        if self.field.has_jumps:
+        if self.field.jumps is not None:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), no_radius)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
@@ -227,7 +227,7 @@ class SignFunction(LevelFunction):
         direction = high - low
         t = np.zeros(len(low))
         normal, is_on_jump = np.zeros_like(low), np.zeros(len(low), np.bool_)
-        if self.field.has_jumps:
+        if self.field.jumps is not None:
             # Halve the segments until few facets are left on them, and then intersect them with
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
@@ -251,7 +251,7 @@ class SignFunction(LevelFunction):
         if not len(x):
             return x
         self.evaluations += len(x)
-        if isinstance(self.field, BatchedField) and not self.field.has_jumps:
+        if isinstance(self.field, BatchedField) and self.field.jumps is None:
             field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
             field_gradient = self.field.gradient(x, precision=self.precision)
@@ -326,7 +326,8 @@ class SignFunction(LevelFunction):
             there is no crossing; and the mask (n,) of segments that cross one.
         """
         backend = choose_backend("double")
-        field = self.field.prepare(backend)
+        jumps = self.field.prepare(backend).jumps
+        assert jumps is not None
         length = row_norms(direction)
         ray = direction / np.maximum(length, 1e-300)[:, None]
         # Rays begin a little before the interval and end a little after it, so that rounding loses
@@ -335,17 +336,17 @@ class SignFunction(LevelFunction):
         origin = start + (first - extension)[:, None] * direction
         max_t = (last - first + 2 * extension) * length
 
-        def next_jump(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
+        def next_crossing(o: Vec3, d: Vec3, limit: Vec3) -> tuple[Real, Vec3]:
             """The t and the normal of the first crossing of a jump surface along rays o + t d, for
             t up to limit.x; t is infinite if there is none."""
             zero = backend.Array3f(0)
             ray_start = JumpCrossing(
                 backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), zero
             )
-            crossing = field.next_jump(o, d, ray_start, limit.x, backend.Bool(True))
+            crossing = jumps.next_crossing(o, d, ray_start, limit.x, backend.Bool(True))
             return crossing.t, crossing.normal
 
-        t, normal = map_batches(backend, next_jump, origin, ray, np.column_stack([max_t] * 3))
+        t, normal = map_batches(backend, next_crossing, origin, ray, np.column_stack([max_t] * 3))
         is_crossed = np.isfinite(t) & (t <= max_t)
         fraction = first - extension + np.where(is_crossed, t, 0.0) / np.maximum(length, 1e-300)
         normal = np.where(is_crossed[:, None], normal, 0.0)
@@ -416,11 +417,12 @@ def _clearances(
 
     if not isinstance(field, WindingNumber):
         return [bound(field)]
-    sheets = field.prepare(backend)
+    jumps = field.prepare(backend).jumps
+    assert jumps is not None
 
     def distance(p: Vec3) -> tuple[Real]:
-        """The distance of the points p from the triangles of the mesh, as a tuple of one."""
-        return (sheets.distance_to_jumps(p),)
+        """The distance of the points p from the triangles of the mesh."""
+        return (jumps.distance(p),)
 
     return [
         bound(WindingModuloOne(field)),

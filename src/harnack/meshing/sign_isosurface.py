@@ -38,10 +38,10 @@ from harnack.geometry.mesh_edges import (
 from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
 from harnack.meshing.checks import check_triangle_limit, points_off_level
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.delaunay_points import TetrahedronPoints
 from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel
-from harnack.meshing.manifold_conversion import from_manifold, to_manifold, without_short_edges
 from harnack.meshing.marching_tetrahedra import Tetrahedra, count_crossings, extract_triangles
 from harnack.meshing.meshing_errors import (
     CELL_SIZE_RATIO,

@@ -17,7 +17,7 @@ from harnack.geometry.mesh_edges import (
     sorted_unique,
 )
 from harnack.geometry.neighborhoods import kd_tree
-from harnack.meshing.manifold_conversion import from_manifold
+from harnack.meshing.closed_mesh import from_manifold
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh

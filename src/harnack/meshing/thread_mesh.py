@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.thread import Thread
-from harnack.meshing.manifold_conversion import to_manifold
+from harnack.meshing.closed_mesh import to_manifold
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.triangle_mesh import TriangleMesh
 

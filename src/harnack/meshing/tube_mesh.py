@@ -16,7 +16,7 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
 from harnack.geometry.mesh_edges import has_distinct_corners, row_norms
-from harnack.meshing.manifold_conversion import to_manifold
+from harnack.meshing.closed_mesh import to_manifold
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh

@@ -8,7 +8,7 @@ from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError
 from harnack.rendering.images import Picture
 from harnack.rendering.isolines import Isolines
-from harnack.rendering.mitsuba_plugins import mitsuba_shape, register, register_surfaces
+from harnack.rendering.mitsuba_plugins import mitsuba_shape, register
 from harnack.rendering.picture import render
 from harnack.rendering.render_options import SHOW_MODES
 from harnack.rendering.stage import MATERIALS, Material
@@ -24,6 +24,5 @@ __all__ = [
     "animate",
     "mitsuba_shape",
     "register",
-    "register_surfaces",
     "render",
 ]

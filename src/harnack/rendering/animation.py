@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,8 @@ from harnack.backend.validation import as_finite
 from harnack.cluster.executor import TaskResult, open_executor
 from harnack.files.file_geometry import check_writable, write_atomically
 from harnack.geometry import Box
-from harnack.progress import progress_bar
+from harnack.optional_packages import import_optional
+from harnack.progress import show_progress
 from harnack.rendering.camera import Camera
 from harnack.rendering.framing import UnboundedSurfaceError, rotation_to_z_up, visible_points
 from harnack.rendering.mitsuba import mitsuba_backend, set_variant
@@ -144,12 +145,12 @@ def animate(
         # Pictures are drawn by `render`, in this process or on a cluster, and added in order.
         job, parts = _job(frames, {"size": size, "progress": False})
         with (
-            progress_bar("film", progress) as advance,
-            open_executor(client, checkpoint) as workers,
+            show_progress("film", progress) as reporter,
+            open_executor(job, client, checkpoint) as workers,
         ):
-            for frame in workers.run_tasks(job, "frame", parts):
+            for frame in workers.run_tasks("frame", parts):
                 add(frame["shown"])
-                advance(1 / count)
+                reporter.advance(1 / count)
     return Animation(target, size)
 
 
@@ -363,12 +364,9 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     """Open the GIF file `path` for writing, to be shown with `fps` pictures a second. The context's
     value is a function that adds a picture (h, w, 3 or 4). The file is written when the block
     ends."""
-    try:
-        from PIL import Image
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "films in .gif files need Pillow: pip install 'harnack[film]'"
-        ) from None
+    Image = import_optional(
+        "PIL.Image", "films in .gif files need Pillow: pip install 'harnack[film]'"
+    )
     pictures: list[Any] = []
 
     def add(pixels: Pixels) -> None:
@@ -397,16 +395,12 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
     """Open the MP4 file `path` for writing, for pictures of `size` (width, height) pixels, `fps` a
     second. The context's value is a function that adds a picture (h, w, 3). An odd row or column at
     the end is left out, as H.264 stores colors for pairs of pixels."""
-    try:
-        import av
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "films in .mp4 files need PyAV: pip install 'harnack[film]', or write a .gif"
-        ) from None
-    library = cast("Any", av)
+    av = import_optional(
+        "av", "films in .mp4 files need PyAV: pip install 'harnack[film]', or write a .gif"
+    )
     if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
-    with library.open(str(path), "w") as container:
+    with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "16"}
@@ -424,7 +418,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             if not stream.codec_context.is_open:
                 stream.width, stream.height = width, height
             height, width = stream.height, stream.width
-            frame = library.VideoFrame.from_ndarray(
+            frame = av.VideoFrame.from_ndarray(
                 np.ascontiguousarray(pixels[:height, :width]), format="rgb24"
             )
             container.mux(stream.encode(frame))

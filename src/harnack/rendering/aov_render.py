@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, to_numpy, upload_floats
+from harnack.cluster.executor import Executor
 from harnack.fields import Field
 from harnack.rendering.hybrid_scene import HybridScene
 from harnack.rendering.images import linear_to_srgb, srgb_to_linear, to_uint8
@@ -30,8 +31,6 @@ from harnack.rendering.mitsuba import mitsuba_backend
 from harnack.rendering.placed_surface import Placement
 from harnack.rendering.scales import Color, ColorScale, add_color_bar, gray_colormap, viridis
 from harnack.rendering.shading import (
-    LocalRenderExecutor,
-    RenderExecutor,
     edge_pixels,
     film_positions,
     multijitter_offsets,
@@ -47,7 +46,7 @@ AOV_BACKGROUNDS = {"dark": _BACKGROUND, "light": (0.90, 0.90, 0.89)}
 """One color for each of the studio's backdrops, to be behind views."""
 _UNKNOWN = (0.45, 0.45, 0.45)
 _IDENTITY = Placement.identity()
-_STATUS_COLORS = {
+STATUS_COLORS = {
     RayStatus.HIT: (0.93, 0.93, 0.90),
     RayStatus.OUT_OF_STEPS: OUT_OF_STEPS_COLOR,
 }
@@ -140,15 +139,15 @@ class AovTask:
         )
 
     def look(
-        self, executor: RenderExecutor | None = None, advance: Callable[[float], None] | None = None
+        self, executor: Executor | None = None, advance: Callable[[float], None] | None = None
     ) -> AovBuffers:
         """Trace all pixels. Returns their `AovBuffers`, with arrays (h, w).
 
-        executor: calls `render_range` of a copy of this task, for example on a cluster; None to
+        executor: runs `render_range` of this task, for example on a cluster; None to
             call it in this process.
         advance: called with the fraction of the pixels that has been finished since the last call.
         """
-        executor = LocalRenderExecutor(self) if executor is None else executor
+        executor = Executor(self) if executor is None else executor
         width, height = self.size
         order = self.order
         ranges, buffers = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
@@ -289,7 +288,7 @@ def status_picture(view: AovBuffers) -> npt.NDArray[np.uint8]:
     """Draw the status of rays as a picture (h, w, 3), in which misses are dark, hits are white, and
     rays out of steps are magenta."""
     picture = np.zeros((*view.status.shape, 3))
-    for status, color in {RayStatus.MISS: view.background, **_STATUS_COLORS}.items():
+    for status, color in {RayStatus.MISS: view.background, **STATUS_COLORS}.items():
         picture[view.status == int(status)] = color
     return to_uint8(picture)
 
@@ -413,7 +412,7 @@ def aov_picture(
     value_range: tuple[float, float] | None,
     bar: str | bool,
     spp: int,
-    executor: RenderExecutor | None = None,
+    executor: Executor | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Draw the pixels (h, w, 3) of a picture of normals, depths, values or other numbers, with a
     color bar if requested.
@@ -457,7 +456,7 @@ def _antialias(
     picture: npt.NDArray[np.uint8],
     colors: Callable[[AovBuffers], npt.NDArray[np.uint8]],
     spp: int,
-    executor: RenderExecutor | None,
+    executor: Executor | None,
 ) -> None:
     """Draw pixels at edges again, each as the mean light of a grid of rays. This changes `picture`
     (h, w, 3) in place. A pixel is at an edge if it differs visibly from a neighbor, or if the edge
@@ -471,7 +470,7 @@ def _antialias(
     order = tiled_pixel_order(viewer.size)
     edges = order[(edge_pixels(picture) | view.is_near_isoline).ravel()[order]]
     offsets = multijitter_offsets(spp)
-    executor = LocalRenderExecutor(viewer) if executor is None else executor
+    executor = Executor(viewer) if executor is None else executor
     ranges = executor.split_range(len(edges), max(1, _RAYS_A_BAND // len(offsets)))
     calls = [(edges[start:stop], offsets) for start, stop in ranges]
     for (pixels, _), samples in zip(

@@ -35,6 +35,8 @@ _STRIP = np.array([0.70, 0.66, 0.60])
 _KEY = (4.7, 4.5, 4.25)
 # The height of the floor, just below what stands on it.
 FLOOR_HEIGHT = -0.002
+# The radius of the floor.
+FLOOR_RADIUS = 100.0
 # Reflectance of the ground, by the backdrop's name. With other backdrops there is no ground, and
 # the surfaces alone are laid over them.
 GROUNDS = {"light": (0.74, 0.73, 0.715), "dark": (0.055, 0.058, 0.065)}
@@ -68,7 +70,7 @@ def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
 def ground(mi: Any, backdrop: str) -> dict[str, Any]:
     """Return a wide floor as an entry of a Mitsuba scene dictionary. backdrop: "light" or
     "dark"."""
-    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR_HEIGHT]).scale(100)
+    floor = mi.ScalarTransform4f().translate([0, 0, FLOOR_HEIGHT]).scale(FLOOR_RADIUS)
     color = {"type": "rgb", "value": list(GROUNDS[backdrop])}
     return {
         "ground": {

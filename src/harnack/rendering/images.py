@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,12 +14,17 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.files.file_geometry import check_writable, write_atomically
+from harnack.optional_packages import import_optional
 from harnack.rendering.mitsuba import load_mitsuba
 
 FloatImage = npt.NDArray[np.float32]
 
 # Radiances up to here are shown as they are; brighter ones approach white smoothly.
 SHOULDER_START = 0.8
+# The transfer function of sRGB (IEC 61966-2-1): a line up to a linear value, which it takes to a
+# value of sRGB; beyond them (1 + offset) x^(1/gamma) - offset.
+SRGB_LINEAR_END, SRGB_LINE_END, SRGB_SLOPE = 0.0031308, 0.04045, 12.92
+SRGB_OFFSET, SRGB_GAMMA = 0.055, 2.4
 _ROWS_AT_ONCE = 64
 
 
@@ -77,19 +82,36 @@ def _tone_mapped(image: FloatArray, behind: FloatImage | None) -> npt.NDArray[np
 
 def _apply_shoulder(radiance: FloatArray) -> FloatArray:
     """Compress radiance above 0.8 smoothly to at most 1. Negative numbers and NaN become 0."""
-    x = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None)
-    room = 1.0 - SHOULDER_START
-    return np.where(x <= SHOULDER_START, x, 1.0 - room * np.exp(-(x - SHOULDER_START) / room))
+    return compress_highlights(np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6), 0.0, None))
 
 
-def linear_to_srgb(x: FloatArray) -> FloatArray:
-    """Convert linear sRGB in [0, 1] to sRGB, by its transfer function."""
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+def compress_highlights(
+    radiance: Any, select: Callable[..., Any] = np.where, exp: Callable[[Any], Any] = np.exp
+) -> Any:
+    """Compress radiance, which is not negative, above 0.8 smoothly to at most 1.
+
+    radiance: NumPy's numbers; or Dr.Jit's, with `drjit.select` and `drjit.exp`.
+    """
+    room = 1 - SHOULDER_START
+    compressed = 1 - room * exp((SHOULDER_START - radiance) / room)
+    return select(radiance > SHOULDER_START, compressed, radiance)
 
 
-def srgb_to_linear(x: FloatArray) -> FloatArray:
-    """Convert sRGB in [0, 1] to linear sRGB: the inverse of `linear_to_srgb`."""
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+def linear_to_srgb(x: Any, select: Callable[..., Any] = np.where) -> Any:
+    """Convert linear sRGB in [0, 1] to sRGB, by its transfer function.
+
+    x: NumPy's numbers; or Dr.Jit's, with `drjit.select`.
+    """
+    power = (1 + SRGB_OFFSET) * x ** (1 / SRGB_GAMMA) - SRGB_OFFSET
+    return select(x <= SRGB_LINEAR_END, SRGB_SLOPE * x, power)
+
+
+def srgb_to_linear(x: Any) -> FloatArray:
+    """Convert sRGB in [0, 1], a number or an array, to linear sRGB, in which amounts of light can
+    be added: the inverse of `linear_to_srgb`."""
+    power = ((x + SRGB_OFFSET) / (1 + SRGB_OFFSET)) ** SRGB_GAMMA
+    linear: FloatArray = cast("Any", np.where)(x <= SRGB_LINE_END, x / SRGB_SLOPE, power)
+    return linear
 
 
 def to_uint8(image: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.uint8]:
@@ -197,13 +219,8 @@ class Picture(np.ndarray[Any, np.dtype[Any]]):
         Raises:
             ModuleNotFoundError: Pillow is not installed.
         """
-        try:
-            from PIL import Image
-        except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                "to_pil needs Pillow: pip install pillow, or take the bytes in `.srgb`"
-            ) from None
-        return Image.fromarray(self.srgb)
+        message = "to_pil needs Pillow: pip install pillow, or take the bytes in `.srgb`"
+        return import_optional("PIL.Image", message).fromarray(self.srgb)
 
     def _repr_png_(self) -> bytes | None:
         """Return the bytes of a PNG file, which notebooks show; None for an array that was computed

@@ -65,7 +65,7 @@ def as_field(function: Any, name: str = "color_by") -> Field:
         except ValueError as error:
             raise ValueError(f"{name.rstrip(',')}: {error}") from None
     if isinstance(function, Field):
-        if function.has_patches:
+        if function.patches is not None:
             raise ValueError(
                 f"{name} must be one function on space, and this {type(function).__name__} has one "
                 "for each part"

@@ -12,7 +12,6 @@ lies in glass, which absorbs light, depends only on the hit at which the segment
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,12 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import Mask, Real, to_numpy
+from harnack.cluster.executor import Executor
+from harnack.optional_packages import import_optional
 from harnack.rendering.hybrid_scene import HybridScene, spawn_ray
 from harnack.rendering.integrator import PathResults, PathTracer, SobolSampler
 from harnack.rendering.mitsuba import refract, refractive_index, transmittance
 from harnack.rendering.shading import (
-    LocalRenderExecutor,
-    RenderExecutor,
     StudioLight,
     film_positions,
     pixel_ranges,
@@ -119,15 +118,15 @@ class PathRenderTask:
 
 
 def render_paths(
-    task: PathRenderTask, advance: Callable[[float], None], executor: RenderExecutor | None = None
+    task: PathRenderTask, advance: Callable[[float], None], executor: Executor | None = None
 ) -> PathRender:
     """Render all pixels of a task. Returns a `PathRender`.
 
     advance: called with the fraction of the picture that has been finished since the last call.
-    executor: calls `render_range` of a copy of the task, for example on a cluster; None to call it
+    executor: runs `render_range` of the task, for example on a cluster; None to call it
         in this process.
     """
-    executor = LocalRenderExecutor(task) if executor is None else executor
+    executor = Executor(task) if executor is None else executor
     width, height = task.size
     features = task.features
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
@@ -323,11 +322,9 @@ def load_denoiser() -> Any:
         ModuleNotFoundError: it is not installed, or its library cannot be loaded.
     """
     try:
-        return importlib.import_module("pyoidn")
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
-        ) from None
+        return import_optional(
+            "pyoidn", "denoise needs Open Image Denoise: pip install 'harnack[denoise]'"
+        )
     except OSError as wrong:
         raise ModuleNotFoundError(f"Open Image Denoise cannot be loaded: {wrong}") from None
 

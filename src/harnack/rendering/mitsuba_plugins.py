@@ -37,7 +37,7 @@ import functools
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.fields import Field
@@ -187,27 +187,16 @@ def register() -> Any:
     `render` and `mitsuba_shape` call it themselves. From then on `mitsuba.render` warns of level
     sets that another integrator would leave out.
     """
-    mi = register_surfaces(mitsuba_proxy.PLUGIN, surface_from_properties)
-    mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
-    patch_mitsuba_render(mi)
-    return mi
-
-
-def register_surfaces(plugin: str, surface: Callable[[Any], TracedSurface]) -> Any:
-    """Register a Mitsuba shape whose surfaces a function makes from `mitsuba.Properties`, and
-    return the module `mitsuba`.
-
-    plugin: the name of the shape.
-    surface: the function. It reads the properties that it knows; `to_world` and the BSDF are read
-        elsewhere.
-    """
     mi = load_mitsuba()
 
     def make_shape(props: Any) -> Any:
         """Return the proxy shape for the properties that a scene gives."""
-        return mitsuba_proxy.from_properties(mi, props, surface(props).with_call_cache())
+        surface = surface_from_properties(props).with_call_cache()
+        return mitsuba_proxy.from_properties(mi, props, surface)
 
-    mi.register_shape(plugin, make_shape)
+    mi.register_shape(mitsuba_proxy.PLUGIN, make_shape)
+    mi.register_integrator(integrator.PLUGIN, integrator.integrator_class(mi.variant()))
+    patch_mitsuba_render(mi)
     return mi
 
 

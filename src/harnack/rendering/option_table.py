@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import os
 
     from harnack.fields import Field
-    from harnack.progress import Advance
+    from harnack.progress import ProgressFunction
     from harnack.rendering.backdrops import Backdrop
     from harnack.rendering.camera import Camera
     from harnack.rendering.isolines import Isolines
@@ -221,7 +221,7 @@ OPTIONS: tuple[Option, ...] = (
            "into (as suits the workers)", "N", text.parse_count, in_files=False),
     Option("progress", "run", PICTURES | DISTANCES | {"page", "mesh", "repair"}, "whether to show "
            "how far the work is", default=True,
-           default_of=dict.fromkeys((*DISTANCES, "mesh", "repair")), in_files=False),
+           default_of=dict.fromkeys((*DISTANCES, "mesh", "repair"), False), in_files=False),
     Option("frames", "film", frozenset(("animate",)), "number of pictures", "N", text.parse_count,
            default=24, in_files=False),
     Option("fps", "film", frozenset(("animate",)), "pictures a second (24)", "N",
@@ -299,7 +299,7 @@ class RenderKeywords(TraceKeywords, total=False):
     client: Any
     checkpoint: str | os.PathLike[str] | None
     chunks: int | None
-    progress: bool | Advance
+    progress: bool | ProgressFunction
 
 
 ShowMode = Literal["path", "shaded", "normal", "evaluations", "status", "depth", "value"]

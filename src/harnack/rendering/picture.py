@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
-from harnack.cluster.executor import open_executor
+from harnack.cluster.executor import Executor, open_executor
 from harnack.fields import Field
-from harnack.progress import Advance, progress_bar
+from harnack.progress import ProgressFunction, show_progress
 from harnack.rendering.aov_render import AOV_MODES, AovTask, aov_picture
 from harnack.rendering.backdrops import GroundBackdrop
 from harnack.rendering.images import Picture, check_picture_path, tone_map, write_image
@@ -38,12 +38,10 @@ from harnack.rendering.option_table import (
     shorthand_among,
     shows_options,
 )
-from harnack.rendering.render_job import EDGE_SPP, ClusterRenderExecutor, RenderJob
+from harnack.rendering.render_job import EDGE_SPP, RenderJob
 from harnack.rendering.render_options import check_chunks, refuse_studio_options
 from harnack.rendering.shaded_render import ShadedTask, render_shaded
 from harnack.rendering.shading import (
-    LocalRenderExecutor,
-    RenderExecutor,
     backdrop_image,
     studio_wall,
 )
@@ -109,7 +107,7 @@ def render(
         noise out of a color picture. It guesses: do not read numbers off such a picture.
     progress: whether a bar on stderr shows how much of the picture is done, and a line before it
         how long a long picture will take. Or a function in place of the bar, which is called with
-        the fraction that was done since its last call; an error that it raises ends the picture.
+        a `Progress`; an error that it raises ends the picture.
     client: a `dask.distributed.Client`, or the address of a scheduler, whose workers draw parts of
         the picture: the same picture bit for bit, whatever the parts and however many the workers.
         Steps that need the whole picture (edges, hidden sky, removal of noise) are done in this
@@ -132,7 +130,7 @@ def render(
     up: what is up, "x", "y", "z", "-x", ... or a direction in the surfaces' coordinates; by
         default z.
     boundary_radius: the radius, in the surfaces' coordinates, of a tube around the curves at which
-        surfaces end (`Field.boundary_curves`). boundary_material: its material, by default "gold".
+        surfaces end (`Field.boundary`). boundary_material: its material, by default "gold".
     section_material: what the faces of opaque solids on their `section` are made of.
     isolines: lines on the surfaces, of heights or of another function, where `show` is "path",
         "shaded" or "value": an `Isolines` or several.
@@ -178,9 +176,8 @@ def render(
     task = job.task
     if is_divided:
         _check_can_be_divided(surfaces, task)
-    with open_executor(client, checkpoint, chunks) as workers:
-        is_local = workers.client is None and workers.checkpoint is None
-        executor = LocalRenderExecutor(task) if is_local else ClusterRenderExecutor(workers, job)
+    with open_executor(job, client, checkpoint, chunks) as workers:
+        executor = Executor(task) if workers.is_local else replace(workers, decode=job.decode)
         title = arguments["color_by"]
         image, shown, names = _render_job(job, executor, title, progress, alone=client is None)
     if target is not None:
@@ -191,9 +188,9 @@ def render(
 
 def _render_job(
     job: RenderJob,
-    executor: RenderExecutor,
+    executor: Executor,
     color_by: Any,
-    progress: bool | Advance,
+    progress: bool | ProgressFunction,
     *,
     alone: bool,
 ) -> tuple[Image, npt.NDArray[np.uint8], list[str] | None]:
@@ -204,8 +201,7 @@ def _render_job(
     executor: calls the methods of the job's task, in this process or on a cluster.
     color_by: the option as the caller set it. If it is a text, it becomes the title of the color
         bar.
-    progress: whether to show a progress bar, or a function that is called with each finished
-        fraction.
+    progress: whether to show a progress bar, or a function that is called with a `Progress`.
     alone: whether this process draws everything. Only then is the time estimated before.
     """
     mi, options, task, sensor = job.mi, job.options, job.task, job.scene.sensors()[0]
@@ -214,10 +210,8 @@ def _render_job(
         return _render_by_mitsuba(mi, job.scene, options)
     if isinstance(task, AovTask):
         # A progress bar is shown only if an executor divides the work.
-        with progress_bar(
-            "rendering", progress and not isinstance(executor, LocalRenderExecutor)
-        ) as advance:
-            view = task.look(executor, advance)
+        with show_progress("rendering", progress and not executor.is_local) as reporter:
+            view = task.look(executor, reporter.advance)
         color_bar = (
             color_by
             if options.color_bar is True and isinstance(color_by, str)
@@ -231,21 +225,19 @@ def _render_job(
     if isinstance(task, PathRenderTask) and alone and progress:
         # A picture on a cluster is not estimated: the estimate measures this process.
         task = _with_time_estimate(job, task, progress)
-        executor = (
-            LocalRenderExecutor(task) if isinstance(executor, LocalRenderExecutor) else executor
-        )
-    with progress_bar("rendering", progress) as advance:
+        executor = Executor(task) if executor.is_local else executor
+    with show_progress("rendering", progress) as reporter:
         if isinstance(task, ShadedTask):
-            image, lost = render_shaded(task, executor, advance)
+            image, lost = render_shaded(task, executor, reporter.advance)
         else:
-            paths = render_paths(task, advance, executor)
+            paths = render_paths(task, reporter.advance, executor)
             image, lost = denoise_image(paths) if options.denoise else paths.image, paths.lost
     _warn_of(lost, _LIT[options.show])
     return *_composite_over_backdrop(mi, sensor, image, job.stage, options.show), None
 
 
 def _with_time_estimate(
-    job: RenderJob, task: PathRenderTask, progress: bool | Advance
+    job: RenderJob, task: PathRenderTask, progress: bool | ProgressFunction
 ) -> PathRenderTask:
     """Estimate how long the picture takes. Returns the task with the number of light paths traced
     at a time chosen such that a progress bar moves every few seconds. If the picture will take

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
-from harnack.cluster.executor import Executor, TaskResult
+from harnack.cluster.executor import TaskResult
 from harnack.fields import Field
 from harnack.fields.field import suggest_field
 from harnack.rendering.aov_render import AOV_MODES, AovBuffers, AovTask
@@ -161,33 +161,15 @@ class RenderJob:
         arrays by name. part: its arguments."""
         return _with_lost(cast("ShadedTask", self._task_in_variant()).refine_pixels(*part))
 
-
-@dataclass(frozen=True)
-class ClusterRenderExecutor:
-    """Runs the parts of a picture on a cluster, whose processes call the methods of a `RenderJob`.
-    The results are those that the task itself would return."""
-
-    executor: Executor
-    job: RenderJob
-
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Divide range(count) into ranges (start, stop) of at most `max_size` elements, as many as
-        suit the cluster."""
-        return self.executor.split_range(count, max_size)
-
-    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
-        one call. Several calls run at the same time. Yields the results in order."""
-        task = self.job.task
-        for arrays in self.executor.run_tasks(self.job, step, parts):
-            # Turn the arrays by name into what the method of the task returns.
-            if isinstance(task, AovTask):
-                period = None if task.function is None else task.function.period
-                yield AovBuffers(**arrays, period=period, background=task.background)
-            elif step == "render_gbuffer":
-                yield GBuffer.from_numbers(self.job.mi, arrays)
-            else:
-                yield arrays["means"], int(arrays["lost"])
+    def decode(self, step: str, arrays: TaskResult) -> Any:
+        """Turn the arrays by name that the method `step` of this job returned into what the method
+        of the task returns."""
+        if isinstance(self.task, AovTask):
+            period = None if self.task.function is None else self.task.function.period
+            return AovBuffers(**cast("Any", arrays), period=period, background=self.task.background)
+        if step == "render_gbuffer":
+            return GBuffer.from_numbers(self.mi, arrays)
+        return arrays["means"], int(arrays["lost"])
 
 
 def _with_lost(result: tuple[Any, int]) -> TaskResult:

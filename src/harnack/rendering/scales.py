@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.name_suggestions import did_you_mean
-from harnack.rendering.images import linear_to_srgb
+from harnack.optional_packages import import_optional
+from harnack.rendering.images import linear_to_srgb, srgb_to_linear
 
 Color = tuple[float, float, float]
 
@@ -110,20 +111,15 @@ def _from_text(text: str, name: str) -> Color:
 def linear_from_srgb(color: Color) -> Color:
     """Convert a color from sRGB to linear sRGB, in which amounts of light can be added (IEC
     61966-2-1)."""
-    red, green, blue = (_linear(channel) for channel in color)
+    red, green, blue = (float(srgb_to_linear(channel)) for channel in color)
     return red, green, blue
-
-
-def _linear(channel: float) -> float:
-    """Convert one channel, in [0, 1], from sRGB to linear sRGB."""
-    return channel / 12.92 if channel <= 0.04045 else math.pow((channel + 0.055) / 1.055, 2.4)
 
 
 # Color maps: numbers as colors.
 
 # Least-squares polynomial of degree 6 to the map "viridis" (Smith and van der Walt, matplotlib,
 # 2015, CC0), lowest degree first; off by at most 0.017.
-_VIRIDIS = np.array(
+VIRIDIS = np.array(
     [
         [0.2745, 0.0058, 0.3327],
         [0.1077, 1.3965, 1.3868],
@@ -144,7 +140,7 @@ def viridis(x: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
     """
     x = np.clip(np.nan_to_num(x), 0.0, 1.0).astype(np.float64)
     colors = np.zeros((*x.shape, 3))
-    for coefficients in _VIRIDIS[::-1]:  # Horner
+    for coefficients in VIRIDIS[::-1]:  # Horner
         colors = colors * x[..., None] + coefficients
     return np.clip(colors, 0.0, 1.0)
 
@@ -347,13 +343,11 @@ def require_pillow() -> tuple[Any, Any, Any]:
     Raises:
         ModuleNotFoundError: Pillow is not installed.
     """
-    try:
-        from PIL import Image, ImageDraw, ImageFont
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError(
-            "a color bar needs Pillow: pip install 'harnack[film]', or leave color_bar away"
-        ) from None
-    return Image, ImageDraw, ImageFont
+    message = "a color bar needs Pillow: pip install 'harnack[film]', or leave color_bar away"
+    image, draw, font = (
+        import_optional(f"PIL.{name}", message) for name in ("Image", "ImageDraw", "ImageFont")
+    )
+    return image, draw, font
 
 
 def typeface_for(text: str, size: int) -> Any:

@@ -44,8 +44,8 @@ from harnack.rendering.shading import (
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.cluster.executor import Executor
     from harnack.geometry import Volume
-    from harnack.rendering.shading import RenderExecutor
 
 
 class ConeCoverage:
@@ -97,12 +97,12 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
         ValueError: the surface consists of level sets of several functions, or its field jumps.
     """
     surface, backend = carrier.surface, mitsuba_backend(mi)
-    if surface.field.has_patches:
+    if surface.field.patches is not None:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
             'for each part. Leave antialias at "edges"'
         )
-    if surface.field.has_jumps:
+    if surface.field.jumps is not None:
         raise ValueError(
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'
@@ -136,11 +136,13 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
     return backend.Array3f(*parameters[:3]), parameters[3], parameters[4]
 
 
-# The number of directions across the picture, and of taps along each; and the length that they
-# cover, as a fraction of the larger side of the picture.
-_DIRECTIONS = 16
-_TAPS = 8
-_REACH = 0.16
+# The number of directions across the picture, and of taps along each; the length that they cover,
+# as a fraction of the larger side of the picture; and the sine of an elevation below which facets
+# and rounding stay.
+SKY_DIRECTIONS = 16
+SKY_SAMPLES = 8
+SKY_REACH = 0.16
+LEAST_SINE = 0.06
 
 
 def ambient_visibility(
@@ -163,7 +165,7 @@ def ambient_visibility(
     count = columns * rows
     index = dr.arange(mi.UInt32, count)
     x, y = mi.Float(index % columns), mi.Float(index // columns)
-    reach_in_pixels = _REACH * max(size)
+    reach_in_pixels = SKY_REACH * max(size)
     reach_in_space = reach_in_pixels * width
 
     def tap(k: int, direction: Any) -> Any:
@@ -171,7 +173,7 @@ def ambient_visibility(
         elevation of its point over the tangent plane, multiplied by a factor that falls with its
         distance; 0 if nothing is seen there."""
         # Points are denser near the pixel: their distances grow quadratically.
-        distance = 1.0 + reach_in_pixels * ((k + 0.5) / _TAPS) ** 2
+        distance = 1.0 + reach_in_pixels * ((k + 0.5) / SKY_SAMPLES) ** 2
         # The pixel nearest to this point of the picture.
         u, v = x + distance * direction.x, y + distance * direction.y
         is_in_picture = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
@@ -179,7 +181,7 @@ def ambient_visibility(
         offset = dr.gather(mi.Vector3f, position, pixel, is_in_picture) - position
         point_distance = dr.norm(offset)
         fade = dr.maximum(1 - dr.square(point_distance / reach_in_space), 0)
-        sine = dr.dot(offset, normal) / point_distance - 0.06  # facets and rounding stay below that
+        sine = dr.dot(offset, normal) / point_distance - LEAST_SINE
         # The sine is NaN if nothing is seen, and then not larger than 0.
         return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
 
@@ -190,19 +192,19 @@ def ambient_visibility(
 
         turn: the index of this direction. hidden: the sum so far.
         """
-        s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / _DIRECTIONS))
+        s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / SKY_DIRECTIONS))
         highest = mi.Float(0)
-        for k in range(_TAPS):
+        for k in range(SKY_SAMPLES):
             highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
         return turn + 1, hidden + dr.square(highest)
 
     def is_running(turn: Any, hidden: Any) -> Any:
         del hidden
-        return turn < _DIRECTIONS
+        return turn < SKY_DIRECTIONS
 
     start = (mi.UInt32(0), dr.zeros(mi.Float, count))
     _, hidden = dr.while_loop(start, is_running, add_direction, label="visible sky")
-    return 1 - hidden / _DIRECTIONS
+    return 1 - hidden / SKY_DIRECTIONS
 
 
 # Rays of one band.
@@ -515,7 +517,7 @@ def _nearest_sky(mi: Any, samples: GBuffer, row: Any, position: FloatArray, sky:
 
 
 def render_shaded(
-    shading: ShadedTask, executor: RenderExecutor, advance: Callable[[float], None]
+    shading: ShadedTask, executor: Executor, advance: Callable[[float], None]
 ) -> tuple[npt.NDArray[np.float32], int]:
     """Render a shaded picture. Returns the image (h, w, 4), linear sRGB radiance and last the
     covered fraction, and the number of rays that ran out of steps.

@@ -42,38 +42,6 @@ def pixel_ranges(pixels: int, step: int) -> Iterator[tuple[int, int]]:
         yield start, min(start + step, pixels)
 
 
-class RenderExecutor(Protocol):
-    """Interface to what runs the tasks of a render: this process, or a Dask cluster. A task is a
-    call of a method of one fixed object that draws the picture."""
-
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Divide range(count) into ranges (start, stop) of at most `max_size` elements each."""
-        ...
-
-    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
-        one call. Yields the results in order."""
-        ...
-
-
-@dataclass(frozen=True)
-class LocalRenderExecutor:
-    """Runs the tasks of a render in this process. drawing: the object whose methods are called."""
-
-    drawing: Any
-
-    def split_range(self, count: int, max_size: int) -> list[tuple[int, int]]:
-        """Divide range(count) into as few ranges (start, stop) of at most `max_size` elements as
-        possible."""
-        return list(pixel_ranges(count, max_size))
-
-    def run_tasks(self, step: str, parts: Sequence[tuple[Any, ...]]) -> Iterator[Any]:
-        """Call the method named `step` once for each entry of `parts`, which holds the arguments of
-        one call. Yields the results, each computed when it is asked for."""
-        method = getattr(self.drawing, step)
-        return (method(*part) for part in parts)
-
-
 def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
     """Return the indices (n,) of all pixels of a picture of `size` (width, height), ordered by
     squares of 4 x 4 pixels. An index counts pixels by rows.
@@ -153,18 +121,18 @@ def edge_pixels(picture: npt.NDArray[np.uint8]) -> BoolArray:
 Color = tuple[float, float, float]
 
 # Irradiance over pi, linear sRGB: of the key light at its brightest, and of the hemisphere.
-_KEY: Color = (0.74, 0.71, 0.66)
-_ABOVE: Color = (0.36, 0.40, 0.46)
-_BELOW: Color = (0.25, 0.225, 0.20)
+KEY_IRRADIANCE: Color = (0.74, 0.71, 0.66)
+SKY_IRRADIANCE: Color = (0.36, 0.40, 0.46)
+GROUND_IRRADIANCE: Color = (0.25, 0.225, 0.20)
 # Towards the key light, along the camera's axes to the right, up and back.
-_TO_KEY = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
+KEY_DIRECTION = np.array([-0.52, 0.62, 0.59]) / np.linalg.norm([-0.52, 0.62, 0.59])
 # The key light reaches round to where its cosine is minus this.
-_WRAP = 0.25
+KEY_WRAP = 0.25
 # The fraction of the key light that is removed if the whole hemisphere is hidden.
-_KEY_HIDDEN = 0.6
-_HIGHLIGHT = 0.22
-_SHARPNESS = 60.0
-_RIM = 0.45
+KEY_HIDDEN = 0.6
+HIGHLIGHT = 0.22
+HIGHLIGHT_EXPONENT = 60.0
+RIM = 0.45
 # The color of transparent matter; and the reflectance of mirrors, which keep their hue.
 _CLEAR: Color = (0.52, 0.60, 0.64)
 _METAL = 0.78
@@ -199,7 +167,7 @@ class StudioLight:
         world_from_camera: (4, 4) the camera's matrix, whose axes point left, up and forward.
         """
         left, up, forward = (axis / np.linalg.norm(axis) for axis in world_from_camera[:3, :3].T)
-        key = np.stack([-left, up, -forward], axis=1) @ _TO_KEY
+        key = np.stack([-left, up, -forward], axis=1) @ KEY_DIRECTION
         return cls(key.tolist(), up.tolist())
 
     def shade(
@@ -217,19 +185,24 @@ class StudioLight:
         """
         key, up = _parameter(normal, self.key), _parameter(normal, self.up)
         # The key light is large: it reaches a little around the terminator.
-        key_cosine = dr.clip((dr.dot(normal, key) + _WRAP) / (1 + _WRAP), 0, 1)
+        key_cosine = dr.clip((dr.dot(normal, key) + KEY_WRAP) / (1 + KEY_WRAP), 0, 1)
         # What hides the sky hides a part of the large key light, too.
-        key_visible = (1 - _KEY_HIDDEN * (1 - visible)) * reached
+        key_visible = (1 - KEY_HIDDEN * (1 - visible)) * reached
         upper_fraction = 0.5 + 0.5 * dr.dot(normal, up)
         # Light of the hemisphere, between its color below and its color above.
-        sky = dr.lerp(_like(color, _BELOW), _like(color, _ABOVE), upper_fraction) * visible
-        radiance = color * (_like(color, _KEY) * (key_cosine * key_visible) + sky)
+        sky = (
+            dr.lerp(_like(color, GROUND_IRRADIANCE), _like(color, SKY_IRRADIANCE), upper_fraction)
+            * visible
+        )
+        radiance = color * (_like(color, KEY_IRRADIANCE) * (key_cosine * key_visible) + sky)
         half_vector = dr.normalize(key + eye)
         # Where the light is below the horizon there is no highlight, and no edge to it either.
-        highlight = _HIGHLIGHT * dr.power(dr.maximum(dr.dot(normal, half_vector), 0), _SHARPNESS)
+        highlight = HIGHLIGHT * dr.power(
+            dr.maximum(dr.dot(normal, half_vector), 0), HIGHLIGHT_EXPONENT
+        )
         # Glossy matter reflects more sky at grazing angles (Schlick).
-        rim = _RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
-        gloss = _like(color, _KEY) * (highlight * key_cosine * key_visible) + sky * rim
+        rim = RIM * dr.power(1 - dr.clip(dr.dot(normal, eye), 0, 1), 5)
+        gloss = _like(color, KEY_IRRADIANCE) * (highlight * key_cosine * key_visible) + sky * rim
         return radiance + dr.select(glossy, gloss, 0)
 
 
@@ -290,17 +263,20 @@ def _like(array: Any, numbers: Sequence[float]) -> Any:
 
 # The number of cells along a side of the shadow's square, and half its side; the square contains
 # all objects on the stage and their shadows.
-_CELLS = 64
-_REACH = 2.4
+FLOOR_CELLS = 64
+FLOOR_HALF_WIDTH = 2.4
 # The number of rays of a cell to the key light, and to the sky. In a block of 4 x 4 cells the rays
 # of all cells differ.
-_RAYS = 8
-_BLOCK = 4
+RAYS_PER_CELL = 8
+SAMPLE_BLOCK = 4
 # The tangent of the angular radius of the key light, and the length of the rays.
-_SPREAD = 0.34
-_SHADOW_RAY_LENGTH = 3.5
-# Weights of a cell and its neighbors along each axis: a block's cells count nearly alike.
-_BLUR = (0.05, 0.2, 0.25, 0.25, 0.2, 0.05)
+KEY_LIGHT_RADIUS = 0.34
+FLOOR_RAY_LENGTH = 3.5
+# The least height of a unit vector to the key light: the floor itself casts no shadow.
+LEAST_KEY_HEIGHT = 0.05
+# Weights of a cell and its neighbors along each axis: a block's cells count nearly alike. Their
+# number is odd, so that the picture stays in place.
+BLUR_WEIGHTS = np.convolve((0.05, 0.2, 0.25, 0.25, 0.2, 0.05), (0.5, 0.5))
 
 
 class ShadowCaster(Protocol):
@@ -331,9 +307,13 @@ class FloorShadow:
         """Compute the shadow of the objects of a scene on the floor, by tracing rays from the floor
         to the key light and to the sky."""
         mi = world.mi
-        cell_centers = (np.arange(_CELLS) + 0.5) / _CELLS * 2 * _REACH - _REACH
+        cell_centers = (
+            np.arange(FLOOR_CELLS) + 0.5
+        ) / FLOOR_CELLS * 2 * FLOOR_HALF_WIDTH - FLOOR_HALF_WIDTH
         y, x = np.meshgrid(cell_centers, cell_centers, indexing="ij")
-        fractions = _visible_fractions(world, x, y, np.stack([_to_key(light.key), _to_sky()]))
+        fractions = _visible_fractions(
+            world, x, y, np.stack([_key_directions(light.key), sky_directions()])
+        )
         image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
@@ -345,7 +325,7 @@ class FloorShadow:
         mi = self.mi
         # Everything on the stage stands above the floor, which is at a small negative height.
         on_floor = position.z < 0.5 * FLOOR_HEIGHT
-        texture_position = mi.Point2f(position.x, position.y) / (2 * _REACH) + 0.5
+        texture_position = mi.Point2f(position.x, position.y) / (2 * FLOOR_HALF_WIDTH) + 0.5
         key, sky = self.texture.eval(dr.select(on_floor, texture_position, 0))
         return dr.select(on_floor, key, 1), dr.select(on_floor, sky, 1)
 
@@ -363,12 +343,12 @@ def _visible_fractions(
     mi = world.mi
     # The place of a point in its block of 4 x 4 points chooses its group of rays.
     j, i = np.indices(x.shape)
-    d = towards[:, (j % _BLOCK) * _BLOCK + i % _BLOCK]
+    d = towards[:, (j % SAMPLE_BLOCK) * SAMPLE_BLOCK + i % SAMPLE_BLOCK]
     # A copy of each point for each of its rays.
     o = np.stack([x, y, np.zeros_like(x)], axis=-1)[:, :, None]
     o = np.broadcast_to(o, d.shape)
     ray = mi.Ray3f(_vectors(mi.Point3f, o), _vectors(mi.Vector3f, d))
-    ray.maxt = mi.Float(_SHADOW_RAY_LENGTH)
+    ray.maxt = mi.Float(FLOOR_RAY_LENGTH)
     is_free = to_numpy(~world.occluded(ray, mi.Bool(True)))
     fractions: FloatArray = is_free.reshape(d.shape[:-1]).mean(axis=-1)
     return fractions
@@ -382,28 +362,36 @@ def _vectors(kind: Any, rows: FloatArray) -> Any:
 def _square() -> FloatArray:
     """Return 16 groups of points in the unit square, (16, rays, 2). All of them together are spread
     evenly (Roberts 2018)."""
-    k = np.arange(_BLOCK * _BLOCK * _RAYS)
+    k = np.arange(SAMPLE_BLOCK * SAMPLE_BLOCK * RAYS_PER_CELL)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
     # Successive points go to different groups.
-    return points.reshape(_RAYS, _BLOCK * _BLOCK, 2).transpose(1, 0, 2)
+    return points.reshape(RAYS_PER_CELL, SAMPLE_BLOCK * SAMPLE_BLOCK, 2).transpose(1, 0, 2)
 
 
-def _to_key(key: Any) -> FloatArray:
+def key_light_points() -> FloatArray:
+    """Return 16 groups of points, (16, rays, 2), spread over the round key light: the distance to
+    its middle, for a light at distance 1, and the angle around it, in radians."""
+    # The square root spreads points evenly over the disc.
+    return np.stack(
+        [KEY_LIGHT_RADIUS * np.sqrt(_square()[..., 0]), 2 * math.pi * _square()[..., 1]], axis=-1
+    )
+
+
+def _key_directions(key: Any) -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
     light. key: (3,) the direction to its middle."""
     axis = np.asarray(key, dtype=np.float64)
     # The coordinate axis that is farthest from `axis` gives a vector at right angles.
     tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     tangent /= np.linalg.norm(tangent)
-    # The square root spreads points evenly over the disc.
-    radius, angle = _SPREAD * np.sqrt(_square()[..., :1]), 2 * math.pi * _square()[..., 1:]
+    radius, angle = np.split(key_light_points(), 2, axis=-1)
     d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
-    d[..., 2] = np.maximum(d[..., 2], 0.05)  # the floor itself casts no shadow
+    d[..., 2] = np.maximum(d[..., 2], LEAST_KEY_HEIGHT)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def _to_sky() -> FloatArray:
+def sky_directions() -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
     of their angle to the vertical."""
     # Uniform squares of the sine give the cosine distribution.
@@ -416,9 +404,9 @@ def _to_sky() -> FloatArray:
 def _blurred(image: FloatArray) -> FloatArray:
     """Blur an image (n, n) along both axes. Outside of the image its values are taken as 1: nothing
     is hidden there."""
-    kernel = np.convolve(_BLUR, [0.5, 0.5])  # of odd length: it stays in place
+    width = len(BLUR_WEIGHTS) // 2
     for _ in range(2):
-        rows = [np.convolve(row, kernel, mode="valid") for row in _framed(image, len(kernel) // 2)]
+        rows = [np.convolve(row, BLUR_WEIGHTS, mode="valid") for row in _framed(image, width)]
         # Rows become columns, so the second pass blurs along the other axis.
         image = np.array(rows).T
     return image
@@ -431,9 +419,18 @@ def _framed(image: FloatArray, width: int) -> FloatArray:
 
 # Backdrops.
 
-# The fraction by which the wall is darker straight above.
-_DARKER = 0.45
+# The fraction by which the wall is darker straight above, and the power of the height with which it
+# grows.
+WALL_DARKENING, WALL_EXPONENT = 0.45, 0.7
 FloatImage = npt.NDArray[np.float32]
+
+
+def wall_brightness(height: Any) -> Any:
+    """Compute the brightness of the wall, relative to that of the ground far away.
+
+    height: of the unit vector to a point of the wall, in [0, 1]; NumPy's or Dr.Jit's numbers.
+    """
+    return 1 - WALL_DARKENING * height**WALL_EXPONENT
 
 
 def studio_wall(
@@ -456,11 +453,11 @@ def studio_wall(
     position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     # From 0 at the horizon to 1 straight above.
-    rise = np.clip(to_numpy(ray.d)[:, 2], 0, 1) ** 0.7
+    height_of_ray = np.clip(to_numpy(ray.d)[:, 2], 0, 1)
     distant = distant_ground_radiance(ground.name, azimuth)
     if show == "shaded":
         distant = _far_shaded(mi, sensor, ground)
-    image = distant * (1 - _DARKER * rise[:, None])
+    image = distant * wall_brightness(height_of_ray[:, None])
     return image.astype(np.float32).reshape(height, width, 3)
 
 

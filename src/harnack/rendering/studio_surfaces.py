@@ -247,7 +247,8 @@ def _boundary_tubes(
         raise ValueError(f"boundary_radius is a length, such as 0.03, not {radius!r}")
     tubes: list[StudioObject] = []
     for k, element in enumerate(objects):
-        curves = element.surface.field.boundary_curves
+        boundary = element.surface.field.boundary
+        curves = () if boundary is None else boundary.curves
         if any(_is_cut_alike(element.surface, earlier.surface) for earlier in objects[:k]):
             continue  # another level of the same
         if curves:

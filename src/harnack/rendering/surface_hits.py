@@ -144,8 +144,8 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     # Of a union of patches (level sets of several functions), the patch that each ray hit.
     prepared = prepared.hit_surface(trace)
-    is_hit = trace.status == int(RayStatus.HIT)
-    is_smooth = is_hit & ~trace.at_jump if prepared.field.has_jumps else is_hit
+    is_hit, has_jumps = trace.status == int(RayStatus.HIT), prepared.field.jumps is not None
+    is_smooth = is_hit & ~trace.at_jump if has_jumps else is_hit
     # The difference between the nearest level and f at the end of the march.
     value_to_level = prepared.levels.offset_to_nearest(trace.value)
     slope_on_ray = dr.dot(trace.gradient, d)
@@ -160,7 +160,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     # Rays without a hit may have t = inf: they are evaluated at their origin.
     t = dr.maximum(dr.select(is_hit, trace.t, 0) + newton_step, 0)
     position = dr.fma(vector(t), d, o)
-    if prepared.field.has_jumps:
+    if has_jumps:
         sample = _sample_where(prepared, position, trace.value, d, is_smooth)
     else:
         sample = prepared.sample(position)
@@ -174,7 +174,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     correction = dr.select(gradient_norm > 0, dr.clip(correction, -reach, reach), 0)
     # If f is farther from the level than before, a facet may lie between, behind which f does not
     # concern this surface.
-    if prepared.field.has_jumps:
+    if has_jumps:
         correction = dr.select(
             dr.abs(correction) * gradient_norm <= dr.abs(value_to_level), correction, 0
         )
@@ -187,11 +187,11 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         ray_offset=RAY_OFFSET * uncertainty,
         value=sample.value,
         evaluations=trace.evaluations + dr.select(is_smooth, prepared.backend.UInt32(1), 0),
-        is_hole_filling=is_smooth & prepared.field.has_jumps,
+        is_hole_filling=is_smooth & has_jumps,
         is_on_section=prepared.backend.Bool(False),
         isoline_index=prepared.backend.UInt32(0),
     )
-    if not prepared.field.has_jumps:
+    if not has_jumps:
         return hit
     return dr.select(trace.at_jump, _hit_on_facet(prepared, o, d, trace, hit), hit)
 

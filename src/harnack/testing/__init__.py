@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from harnack.testing.enclosure_contracts import check_enclosure
 from harnack.testing.field_contracts import check_field, check_ray_samples
-from harnack.testing.violation_search import BrokenPromiseError, mutated_enclosure
+from harnack.testing.violation_search import BrokenPromiseError
 
 __all__ = [
     "BrokenPromiseError",
     "check_enclosure",
     "check_field",
     "check_ray_samples",
-    "mutated_enclosure",
 ]

@@ -84,7 +84,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     try:
         _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
-        if not field.has_variable_accuracy:
+        if field.variable_accuracy is None:
             raise
         # The Hessian may be the derivative of the exact gradient, without truncation error.
         exact_trials = [_without_truncation(field, points, promise) for promise in trials]
@@ -174,12 +174,8 @@ def _without_truncation(
     field: Field, points: FloatArray, stencil: list[_StencilSample]
 ) -> list[_StencilSample]:
     """The stencil (samples at the nodes) with the gradients of the exact field, without the
-    truncation error of a treecode (`Field.exact`). It is needed because the Hessian that a treecode
-    computes may be the derivative of its own gradient or of the exact one.
-
-    points: (n, 3) the points of the differences.
-    stencil: the samples at all nodes.
-    """
+    truncation error of a treecode (`exactly_sampled`). It is needed because the Hessian that a
+    treecode computes may be the derivative of its own gradient or of the exact one."""
     error = sample_field(field, points, closely=True).gradient_error
     exact: list[_StencilSample] = []
     for node_sample in stencil:

@@ -245,7 +245,7 @@ def _overrides_sample_ray(field: Field) -> bool:
     """Whether the field computes the enclosures of its change along a ray by a method of its own,
     and not from its promises (proved bounds near a point) as other fields do. Fields with jumps do
     not count."""
-    return type(field).sample_ray is not Field.sample_ray and not field.has_jumps
+    return type(field).sample_ray is not Field.sample_ray and field.jumps is None
 
 
 def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:

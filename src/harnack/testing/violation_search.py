@@ -14,11 +14,11 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
-from harnack.enclosures import BoundedLaplacian, Enclosure, HarmonicBall, LevelGaps, SlopeRange
-from harnack.fields.capabilities import NO_FACET, JumpCrossing
+from harnack.enclosures import BoundedLaplacian, HarmonicBall, SlopeRange
+from harnack.fields.capabilities import NO_FACET, JumpCrossing, exactly_sampled
 
 if TYPE_CHECKING:
-    from harnack.backend import Mask, Precision, Real
+    from harnack.backend import Precision
     from harnack.enclosures import Promise
     from harnack.fields.field import Field, Sample
 
@@ -28,8 +28,6 @@ __all__ = [
     "RayLift",
     "accumulated_jumps",
     "lift_along_rays",
-    "mutated_enclosure",
-    "original_enclosure",
     "random_directions",
     "random_points",
     "require",
@@ -69,41 +67,6 @@ def require(
     raise BrokenPromiseError(
         f"{message}{size}: point {points[worst].tolist()}{at}; {ids.size} of {len(points)} points"
     )
-
-
-def mutated_enclosure(kind: type[Enclosure], factor: float, *, covers: float | None = None) -> Any:
-    """A class of enclosures that is wrong on purpose, to test that the checks detect it: its free
-    lengths (lengths proved to hold no level) are multiplied by a factor.
-
-    kind: the class from which it is derived.
-    factor: multiplies every free length.
-    covers: multiplies every length that `is_free` accepts; None for the same factor.
-    """
-    covers_factor = factor if covers is None else covers
-    # Type checkers accept no variable as a base class.
-    base: Any = kind
-
-    class Scaled(base):
-        """The class `kind` with all lengths scaled."""
-
-        original = kind
-
-        def free_length(self, gaps: LevelGaps) -> Real:
-            parent: Any = super()
-            return factor * parent.free_length(gaps)
-
-        def is_free(self, gaps: LevelGaps, length: Real) -> Mask:
-            parent: Any = super()
-            return parent.is_free(gaps, length / covers_factor)
-
-    Scaled.__name__ = f"Scaled{kind.__name__}"
-    return Scaled
-
-
-def original_enclosure(kind: type[Enclosure]) -> type[Enclosure]:
-    """The class from which `mutated_enclosure` made the class `kind`. A class that it did not make
-    is returned as it is."""
-    return getattr(kind, "original", kind)
 
 
 # Fields from outside: values, gradients and continuous lifts.
@@ -212,24 +175,21 @@ def lift_along_rays(
 def accumulated_jumps(
     field: Field, start: FloatArray, direction: FloatArray, lengths: FloatArray
 ) -> FloatArray:
-    """An array (n, m): for each of n rays, the sums of the jumps of f across facets between the
-    ray's first point and each of its m points. The field's method `next_jump` reports the jumps one
-    after the other.
-
-    start, direction: (n, 3) the starts of the rays, and unit vectors.
-    lengths: (n, m) the points of a ray are start + t direction for each t of its row.
-    """
+    """(n, m) the sums of the jumps of f across facets between the first point and each other point
+    of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
+    `Jumps.next_crossing` reports the jumps one after the other."""
     total = np.zeros_like(lengths)
-    if not field.has_jumps:
+    if field.jumps is None:
         return total
     backend = choose_backend("double")
-    prepared = field.prepare(backend)
+    jumps = field.prepare(backend).jumps
+    assert jumps is not None
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
     # The crossing before the first one is at the start of the ray, on no facet.
     first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
-        crossing = prepared.next_jump(o, d, crossing, last, backend.Bool(True))
+        crossing = jumps.next_crossing(o, d, crossing, last, backend.Bool(True))
         t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
         # Rays without another crossing have t = inf.
         is_ahead = np.isfinite(t)
@@ -271,7 +231,7 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
     """
     backend = choose_backend(precision)
     prepared = field.prepare(backend)
-    evaluator = prepared.exact(backend) if closely else prepared
+    evaluator = exactly_sampled(prepared, backend) if closely else prepared
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 
@@ -436,7 +396,7 @@ class _ViolationSearch:
         """Whether the change of f between two points has to be followed along a path between them,
         because f jumps or is known modulo a period only. Otherwise it is the difference of the
         values."""
-        return self.field.period is not None or self.field.has_jumps
+        return self.field.period is not None or self.field.jumps is not None
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
         """Evaluate pairs of points: make the pairs of p (n, 3) and y = p + reach * w, where reach

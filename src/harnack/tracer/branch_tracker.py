@@ -24,7 +24,7 @@ from harnack.tracer.level_rule import LevelReading, read_plainly
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
-    from harnack.fields.field import Field
+    from harnack.fields.capabilities import ModuloOne, VariableAccuracy
     from harnack.fields.samples import Ray, RaySample, Sample
     from harnack.geometry import Volume
     from harnack.tracer.march import MarchState
@@ -92,11 +92,17 @@ class BranchTracker:
     levels: Levels
 
     def begin(
-        self, field: Field, known: Volume, path: Ray, ends: tuple[Real, Real], state: MarchState
+        self,
+        samples: ModuloOne,
+        known: Volume,
+        path: Ray,
+        ends: tuple[Real, Real],
+        state: MarchState,
     ) -> MarchState:
         """The state of rays at their start: `state` with f at the start and the accuracy scale of
         the first sample.
 
+        samples: how f is sampled up to an integer.
         known: a volume outside of which the branch is that of f = 0.
         ends: t_min and t_max of the rays `path`. They are marched from `state.proved_to` on.
 
@@ -108,17 +114,16 @@ class BranchTracker:
         starts_outside = (entry > ends[0]) & (start <= entry)
         starts_inside = state.active & ~starts_outside
         rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
-        value = field.value_if_cheap(path.point(start), rounding, starts_inside)
+        value = samples.value_if_cheap(path.point(start), rounding, starts_inside)
         has_branch = starts_outside | dr.isfinite(value)
-        # Accuracy scale 0 is the coarsest, which may lack the branch.
-        accuracy = dr.select(has_branch, 0, backend.Float(field.coarsest_accuracy))
+        # VariableAccuracy scale 0 is the coarsest, which may lack the branch.
+        accuracy = dr.select(has_branch, 0, backend.Float(samples.sure_accuracy))
         value = dr.select(dr.isfinite(value), value, 0)
         return replace(state, accuracy_scale=accuracy, value=backend.Float(value))
 
-    def accuracy_of(self, field: Field, scale: Real) -> Real:
-        """The accuracy scale with which `field` is sampled: `scale` itself, for which the march
-        asks."""
-        del field
+    def accuracy_of(self, accuracy: VariableAccuracy, scale: Real) -> Real:
+        """The accuracy scale that the march asks for."""
+        del accuracy
         return scale
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:

@@ -59,9 +59,9 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     field = prepared.field
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         field.refuse_hidden_parameters()
-    parameters = prepared.field.parameters()
+    parameters = prepared.field.differentiable_parameters()
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
-    if field_has_derivatives and prepared.field.has_jumps:
+    if field_has_derivatives and prepared.field.jumps is not None:
         name = type(prepared.field).__name__
         raise NotImplementedError(
             f"hits of a field with jumps cannot be differentiated by its parameters: detach "
@@ -106,7 +106,7 @@ def refuse_derivative(
         these.
     result_name: the name of the result, for the message.
     """
-    sources = [o, d, *prepared.levels.values, *prepared.field.parameters()]
+    sources = [o, d, *prepared.levels.values, *prepared.field.differentiable_parameters()]
     return dr.custom(_NoDerivative, value, result_name, sources)
 
 
@@ -128,7 +128,7 @@ def attach_derivatives(
     """
     # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
     t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
-    if prepared.field.has_jumps:
+    if prepared.field.jumps is not None:
         t = _on_plane(prepared, o, d, end)
         is_hit &= ~end.at_jump
     backend = prepared.backend
@@ -136,11 +136,12 @@ def attach_derivatives(
         t_hit = dr.select(is_hit, t, 0)
         origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
-        if prepared.field.has_variable_accuracy:
+        accuracy = prepared.field.variable_accuracy
+        if accuracy is not None:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
             detail = dr.select(is_hit, backend.Float(EXACT), 0)
-            prepared = replace(prepared, field=prepared.field.at_accuracy(detail))
+            prepared = replace(prepared, field=accuracy.at(detail))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
@@ -160,7 +161,7 @@ def attach_derivatives(
     # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
     # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
-    if any(dr.grad_enabled(parameter) for parameter in prepared.field.parameters()):
+    if any(dr.grad_enabled(parameter) for parameter in prepared.field.differentiable_parameters()):
         # f depends on parameters, too: its own derivative has all of them.
         value = prepared.field.differentiable_value(point)
         change = value - dr.detach(value)

@@ -277,7 +277,7 @@ def _first_hits(
     length = norm(end.gradient)
     normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     index = dr.full(backend.Int32, -1, dr.width(end.status))
-    if prepared.field.has_jumps:
+    if prepared.field.jumps is not None:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
@@ -386,8 +386,8 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
     def search(hit: _SearchedHits) -> _SearchDistance:
         """Return the distance from each hit within which the surface was found."""
         sampled = field
-        if field.has_patches:
-            sampled = field.patch(dr.reinterpret_array(backend.UInt32, hit.part))
+        if field.patches is not None:
+            sampled = field.patches.patch(dr.reinterpret_array(backend.UInt32, hit.part))
         return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.doubtful))
 
     doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)

@@ -29,7 +29,7 @@ from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.field import Field
+    from harnack.fields.capabilities import Jumps
     from harnack.fields.samples import Ray
 
 # Facets count as crossed at the same point if they are at most the first number of roundings of the
@@ -46,8 +46,8 @@ class JumpTraceState:
     """The state of rays through a function f with jumps at facets (triangles), between two
     intervals of the march.
 
-    offset: a number from which the field makes f on an interval (`Field.continuation`): that at the
-        start of the ray (`Field.initial_offset`) plus all jumps since.
+    offset: a number from which the field makes f on an interval (`Jumps.continuation`): that at the
+        start of the ray (`Jumps.initial_offset`) plus all jumps since.
     behind: the crossing of a facet that was passed last.
     march: the state of the march.
     reported_facet: for rays that look for crossings of the level, the index of the facet that is
@@ -99,7 +99,7 @@ class JumpTracer:
     continuous.
 
     march: marches rays through the intervals.
-    field: the function f.
+    jumps: the facets at which f jumps.
     path: the rays.
 
     A smooth hit is a hit that is not on a facet: a point within the tolerance of a level set, that
@@ -110,7 +110,7 @@ class JumpTracer:
     """
 
     march: March
-    field: Field
+    jumps: Jumps
     path: Ray
     start: Real
     end: Real
@@ -147,7 +147,7 @@ class JumpTracer:
         o, d = self.path.origin, self.path.direction
         # A little before the start, so that a facet at the very start is crossed.
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
-        offset = real(self.field.initial_offset(o, d, before, state.active))
+        offset = real(self.jumps.initial_offset(o, d, before, state.active))
         start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
         reported = None if state.contact is None else count(NO_FACET)
         return JumpTraceState(offset, start, state, reported)
@@ -197,7 +197,7 @@ class JumpTracer:
         step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
         # The function that is f on this interval and continues it beyond the facets.
-        field = self.field.continuation(o, d, behind, ahead, outer.offset)
+        field = self.jumps.continuation(o, d, behind, ahead, outer.offset)
         now = self.march.advance(field, self.path, stop, now, ahead)
         # A march that ends at a facet as a miss has passed it.
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
@@ -348,7 +348,7 @@ class JumpTracer:
         active: mask of rays that need the result.
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        ahead = self.field.next_jump(self.path.origin, self.path.direction, behind, end, active)
+        ahead = self.jumps.next_crossing(self.path.origin, self.path.direction, behind, end, active)
         is_valid = real(ahead.t) <= end
         is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(

@@ -73,7 +73,7 @@ def largest_component_cells(
         """Compute the grid, which is not in the cache."""
         return _build_cells(field.with_levels(levels), levels, volume, solid, across)
 
-    if field.parameters():  # they may change in place
+    if field.differentiable_parameters():  # they may change in place
         return build()
     return _CELLS.get(field, (levels, volume, solid, across), build)
 

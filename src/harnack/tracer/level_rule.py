@@ -20,7 +20,7 @@ from harnack.fields.samples import value_error_bound
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
     from harnack.enclosures import LevelGaps, Levels
-    from harnack.fields.field import Field
+    from harnack.fields.capabilities import VariableAccuracy
     from harnack.fields.samples import RaySample
 
 
@@ -76,9 +76,9 @@ class LevelRule(Protocol):
         """The values of f that rays look for."""
         ...
 
-    def accuracy_of(self, field: Field, scale: Real) -> Real:
+    def accuracy_of(self, accuracy: VariableAccuracy, scale: Real) -> Real:
         """The accuracy scale with which the field is sampled where the march asks for `scale`.
-        Larger is more accurate."""
+        Larger is more accurate. accuracy: how the field can be sampled."""
         ...
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
@@ -98,10 +98,10 @@ class PlainLevels:
 
     levels: Levels
 
-    def accuracy_of(self, field: Field, scale: Real) -> Real:
-        """The accuracy scale with which `field` is sampled: `scale`; but at least 1 for a field
-        whose coarser samples may lack an integer."""
-        return fmax(scale, 1) if field.has_unknown_branch else scale
+    def accuracy_of(self, accuracy: VariableAccuracy, scale: Real) -> Real:
+        """The accuracy scale `scale`; but at least 1 for a field whose coarser samples may lack an
+        integer."""
+        return fmax(scale, 1) if accuracy.may_lack_integer else scale
 
     def read(self, ray_sample: RaySample, before: Real, step: Real, size: Real) -> LevelReading:
         """Compare the samples `ray_sample` with the levels. size: a bound of the absolute values of

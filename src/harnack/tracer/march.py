@@ -95,8 +95,8 @@ class MarchState:
     tolerance_excess: by how much |f - level| at `proved_to` may exceed what the hit tolerance
         allows, because of rounding.
     evaluations: the number of evaluations of f so far.
-    accuracy_scale: the accuracy scale of the next sample (`Field.at_accuracy`); larger is more
-        accurate. None if f has a single accuracy. (A number would never change then, and Dr.Jit
+    accuracy_scale: the accuracy scale of the next sample (`VariableAccuracy`); larger is more
+        accurate. None if f has a single accuracy. (Then a number would never change, and Dr.Jit
         records a loop twice if a part of its state never changes.)
     status: how the ray ended, a `RayStatus`.
     active: whether the ray goes on.
@@ -486,8 +486,9 @@ class March:
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
         scaled = field
-        if now.accuracy_scale is not None and field.has_variable_accuracy:
-            scaled = field.at_accuracy(self.rule.accuracy_of(field, now.accuracy_scale))
+        if now.accuracy_scale is not None and field.variable_accuracy is not None:
+            scale = self.rule.accuracy_of(field.variable_accuracy, now.accuracy_scale)
+            scaled = field.variable_accuracy.at(scale)
         unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
         ray_sample = scaled.sample_ray(
             path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0))
@@ -533,7 +534,7 @@ class March:
             is_near=is_near,
             accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
-            is_smooth=ahead is None and not field.has_variable_accuracy,
+            is_smooth=ahead is None and field.variable_accuracy is None,
             reading=reading,
             steep=steep,
             extra_evaluations=evaluations,
@@ -668,9 +669,10 @@ class March:
         is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
-        if now.accuracy_scale is None or not field.has_variable_accuracy:
+        sampling = field.variable_accuracy
+        if now.accuracy_scale is None or sampling is None:
             return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
-        truncation, coarsest = trial.on_ray.sample.truncation_error, field.coarsest_accuracy
+        truncation, coarsest = trial.on_ray.sample.truncation_error, sampling.coarsest
         smallest_gap = self._deciding_gap(trial.value, ahead, trial.at_end)
         accuracy = fmax(now.accuracy_scale, coarsest)
         finer, too_coarse = _refined_accuracy(

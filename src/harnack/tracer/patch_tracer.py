@@ -27,7 +27,7 @@ from harnack.tracer.march import March, MarchState
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
-    from harnack.fields.field import Field
+    from harnack.fields.capabilities import Patches
     from harnack.fields.samples import Ray
 
 
@@ -65,13 +65,13 @@ class PatchTracer:
     with a function and a box of its own.
 
     march: marches rays to one level set.
-    field: the union of patches.
+    patches: the patches of the surface.
     path: the rays.
     any_hit: whether a ray may end at any hit, and not only at the first.
     """
 
     march: March
-    field: Field
+    patches: Patches
     path: Ray
     start: Real
     end: Real
@@ -145,13 +145,13 @@ class PatchTracer:
         backend, path = self.march.backend, self.path
         # The last entry. Entries are ordered by `enter` and `patch` alone; its `leave` is not used.
         after = PatchEntry(walk.enter, walk.enter, walk.box)
-        entry = self.field.next_patch(
+        entry = self.patches.next_entry(
             path.origin, path.direction, after, self.start, walk.t, walk.active
         )
         active = walk.active & (entry.patch != NO_PATCH)
         start, end = fmax(entry.enter, self.start), fmin(entry.leave, walk.t)
         # (Inactive lanes get patch 0, since NO_PATCH is no index.)
-        patch = self.field.patch(dr.select(active, entry.patch, 0))
+        patch = self.patches.patch(dr.select(active, entry.patch, 0))
         used_all_steps = active & (walk.evaluations >= self.march.max_steps)
         now = MarchState.at(backend, start, end, active & ~used_all_steps, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))

@@ -109,10 +109,10 @@ class PixelCones:
         start, t_end = self._clip()
         end = fmin(t_end, real(t_max))
         state = MarchState.at(
-            backend, start, end, active, has_detail=prepared.field.has_variable_accuracy
+            backend, start, end, active, has_detail=prepared.field.variable_accuracy is not None
         )  # fmt: skip
         margin = (
-            _START_MARGIN_APPROXIMATE if prepared.field.has_variable_accuracy else _START_MARGIN
+            _START_MARGIN if prepared.field.variable_accuracy is None else _START_MARGIN_APPROXIMATE
         )
         # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
@@ -127,13 +127,11 @@ class PixelCones:
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
         def sample_at(t: Real) -> tuple[Real, Real]:
-            """Return the height over the surface at the ray parameters t, in radii of the cone, and
-            the derivative of the height along the ray."""
-            field = (
-                prepared.field
-                if now.accuracy_scale is None
-                else prepared.field.at_accuracy(now.accuracy_scale)
-            )
+            """Return the height over the surface at parameters t, in radii of the cone, and its
+            derivative along the ray."""
+            field, accuracy = prepared.field, prepared.field.variable_accuracy
+            if accuracy is not None and now.accuracy_scale is not None:
+                field = accuracy.at(now.accuracy_scale)
             sample = field.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
             return self._height(sample.value, sample.gradient, t, side, level)
 

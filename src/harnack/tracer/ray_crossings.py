@@ -137,14 +137,15 @@ def find_crossings(
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
     dr.make_opaque(t, side, before, behind, gradient, facets)
-    tracer = JumpTracer(march, prepared.field, path, start, end)
+    jumps = prepared.field.jumps
+    tracer = None if jumps is None else JumpTracer(march, jumps, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
         """Bring each active ray to its next crossing, to the next jump of f, or to its end. Returns
         the state after it. A crossing is written to the arrays outside, in the next free place of
         its ray."""
         next_state, facet = now, None
-        if now.sheets is None:
+        if tracer is None or now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
             walk = tracer.advance(now.sheets)
@@ -155,7 +156,7 @@ def find_crossings(
         is_at_crossing = now.active & (after.status == int(RayStatus.HIT))
         # If the surface consists of facets only, other crossings do not count.
         is_crossing = is_at_crossing
-        if facet is not None and prepared.field.only_sheets:
+        if facet is not None and jumps is not None and jumps.takes_all_levels:
             is_crossing = is_at_crossing & (facet != NO_FACET)
         slot = first_slot + now.count
         dr.scatter(t, contact.root, slot, is_crossing)
@@ -186,7 +187,7 @@ def find_crossings(
         )
 
     begin = _SearchState(state, None, dr.zeros(count, n))
-    if prepared.field.has_jumps:
+    if tracer is not None:
         begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now

@@ -309,18 +309,18 @@ class SurfaceTracer:
         value: an approximation of f at p with an error below a half. The integer is chosen for
             which f is nearest to it.
         """
-        if self.known_branch_volume is None:
+        if self.known_branch_volume is None or self.field.modulo_one is None:
             return self.sample(p)
-        sample = self.field.evaluate_modulo_one(p)
+        sample = self.field.modulo_one.evaluate(p)
         return sample.shifted(dr.round(value - sample.value))
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
         """Return the surface that each ray hit: the patch that was hit if the field is a union of
         patches, else this surface. Rays without a hit get the first patch."""
-        if hit.patch is None:
+        if hit.patch is None or self.field.patches is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
-        return replace(self, field=self.field.patch(patch))
+        return replace(self, field=self.field.patches.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
         """Return the mask of the points p at which a level, if f takes one there, belongs to the
@@ -386,7 +386,7 @@ class SurfaceTracer:
             excess, side = dr.select(is_hit, contact.tolerance_excess, 0), contact.side
         t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
         patch = None
-        if self.field.has_patches:
+        if self.field.patches is not None:
             facet, patch = self.backend.UInt32(NO_FACET), facet
         return MarchResult(
             t, end.value, gradient, excess, evaluations, end.status, facet, side, patch
@@ -402,7 +402,7 @@ class SurfaceTracer:
             unchanged if f has jumps, or if it has no creases, as then it is good enough.
         active: mask of rays with a crossing.
         """
-        if self.field.has_jumps or not self.field.has_creases:
+        if self.field.jumps is not None or not self.field.has_creases:
             return (
                 contact.root,
                 contact.gradient,
@@ -432,7 +432,8 @@ class SurfaceTracer:
         path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
         t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
         start, end = self.clip(path.origin, path.direction, t_min, t_max)
-        has_detail = self.field.has_variable_accuracy or self.field.has_jumps
+        has_jumps = self.field.jumps is not None
+        has_detail = self.field.variable_accuracy is not None or has_jumps
         hysteresis = None
         if crosses:
             start, end, hysteresis = self._crossing_interval(
@@ -445,10 +446,10 @@ class SurfaceTracer:
             is_nonempty = backend.Bool(active) & (start < end)
             start, end = dr.select(is_nonempty, start, 0), dr.select(is_nonempty, end, 0)
             empty_until = occupied.end_of_empty_run(path.origin, path.direction, start, end)
-            if not self.field.has_jumps:
+            if not has_jumps:
                 start = empty_until
         state = MarchState.at(backend, start, end, active, has_detail=has_detail, crosses=crosses)
-        if occupied is not None and self.field.has_jumps and not self.only_component:
+        if occupied is not None and has_jumps and not self.only_component:
             # Facets in empty cells have to be compared with the level. So the ray starts before
             # them, and its first proved step leads to empty_until.
             state = replace(state, proved_step=empty_until - start)
@@ -459,9 +460,10 @@ class SurfaceTracer:
             status = dr.select(in_uncertain_cell, out_of_steps, state.status)
             state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
         rule: LevelRule = PlainLevels(self.levels)
-        if self.known_branch_volume is not None and not crosses:
+        samples, known = self.field.modulo_one, self.known_branch_volume
+        if samples is not None and known is not None and not crosses:
             rule = tracker = BranchTracker(self.levels)
-            state = tracker.begin(self.field, self.known_branch_volume, path, (t_min, t_max), state)
+            state = tracker.begin(samples, known, path, (t_min, t_max), state)
         march = March(
             backend,
             rule,
@@ -546,10 +548,10 @@ class SurfaceTracer:
             path, start, end: the rays, and the ray parameters between which they are traced.
             """
             to_end = replace(march, ray_end=end)
-            if self.field.has_jumps:
-                return JumpTracer(to_end, self.field, path, start, end)
-            if self.field.has_patches:
-                return PatchTracer(to_end, self.field, path, start, end, any_hit)
+            if self.field.jumps is not None:
+                return JumpTracer(to_end, self.field.jumps, path, start, end)
+            if self.field.patches is not None:
+                return PatchTracer(to_end, self.field.patches, path, start, end, any_hit)
             return SmoothTracer(to_end, self.field, path, end)
 
         if self.uses_ray_queue and march.hysteresis is None and not self.field.is_cheap:

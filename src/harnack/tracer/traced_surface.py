@@ -51,6 +51,23 @@ _FIRST_HITS_ONLY = (
 )
 
 
+class CallCache:
+    """Keeps results for the length of one call of the library, by a field and a key. Unlike those
+    of a `FieldCache`, which last as long as the field, they need not be compared with the field's
+    attributes, which do not change during a call; and they may refer to the field."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Any, tuple[Any, Field]] = {}
+
+    def get_or_make(self, field: Field, key: Any, make: Callable[[], _T]) -> _T:
+        """Return the result for this field and key: that of `make()` at the first time."""
+        full_key = id(field), key
+        if full_key not in self._kept:
+            # With a reference to the field, so that no other field gets its id.
+            self._kept[full_key] = make(), field
+        return self._kept[full_key][0]
+
+
 @dataclass(frozen=True)
 class TracedSurface:
     """A surface and how rays are traced to it, for one call of the library. The surface consists of
@@ -84,7 +101,7 @@ class TracedSurface:
     over_relaxation: float = 1.4
     require_crossing: bool = False
     # Results of `memoize`; None outside of a call of the library.
-    _call_cache: dict[Any, Any] | None = dataclasses.field(
+    _call_cache: CallCache | None = dataclasses.field(
         default=None, repr=False, compare=False, kw_only=True
     )
 
@@ -143,12 +160,12 @@ class TracedSurface:
                 one level at once.
             NotImplementedError: the field is a union of patches, each with a function of its own.
         """
-        if self.field.has_patches:
+        if self.field.patches is not None:
             raise NotImplementedError(
                 f"{option} takes one function, and this {type(self.field).__name__} has one for "
                 "each patch: trace a patch by itself, such as mesh.face(0) of a polygon mesh"
             )
-        if self.field.has_jumps and len(self.levels) > 1:
+        if self.field.jumps is not None and len(self.levels) > 1:
             raise ValueError(
                 f"{option} takes one level of a field with jumps, such as this "
                 f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
@@ -178,20 +195,16 @@ class TracedSurface:
         begins: whether to start with an empty cache even if the surface has one, as users may have
             changed the field in place since the last call.
         """
-        return (
-            self if self._call_cache is not None and not begins else replace(self, _call_cache={})
-        )
+        if self._call_cache is not None and not begins:
+            return self
+        return replace(self, _call_cache=CallCache())
 
     def memoize(self, key: Any, compute: Callable[[], _T]) -> _T:
         """Return `compute()`. Within a call of the library the result is cached for this field,
         these levels and `key`; otherwise `compute` is called each time."""
         if self._call_cache is None:
             return compute()
-        full_key = key, id(self.field), self.level_values
-        if full_key not in self._call_cache:
-            # With a reference to the field, so that no other field gets its id.
-            self._call_cache[full_key] = compute(), self.field
-        return self._call_cache[full_key][0]
+        return self._call_cache.get_or_make(self.field, (key, self.level_values), compute)
 
     @property
     def extent(self) -> Volume | None:
@@ -218,7 +231,8 @@ class TracedSurface:
     def evaluator(self, backend: Backend) -> Field:
         """Return the field, prepared for its levels and for a backend. It is cached; a field with
         derivatives enabled and one without have separate entries."""
-        has_derivatives = any(dr.grad_enabled(parameter) for parameter in self.field.parameters())
+        parameters = self.field.differentiable_parameters()
+        has_derivatives = any(map(dr.grad_enabled, parameters))
         key = "field", backend, has_derivatives
         return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
 
@@ -271,7 +285,7 @@ class TracedSurface:
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None
-        if field.has_unknown_branch and all(
+        if field.modulo_one is not None and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
         ):
             # Outside the extent of the levels and of their remainders modulo 1, f is nearer to 0
@@ -328,11 +342,11 @@ def check_has_inside(surface: TracedSurface) -> None:
         return
     if field.period is not None:
         raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
-    if field.has_patches:
+    if field.patches is not None:
         raise ValueError(
             f"a {type(field).__name__} is many surfaces and no closed solid: draw it without side"
         )
-    if field.has_jumps:
+    if field.jumps is not None:
         raise ValueError(
             "a field that jumps has no closed solid: values on one side may end at a facet, with "
             "no level there; draw its level set without side"

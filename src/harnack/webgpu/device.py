@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from harnack.backend import IntArray, backend_of, to_numpy
 from harnack.backend.arrays import upload_integers
+from harnack.optional_packages import import_optional
 from harnack.webgpu.recording import labeled_leaves, record_kernel
 from harnack.webgpu.wgsl import WORKGROUP, Shader
 
@@ -76,12 +77,11 @@ def find_device() -> Device:
     Raises:
         NoDeviceError: there is no device, or the package `wgpu` is not installed.
     """
+    message = 'backend="webgpu" needs the package wgpu: pip install "harnack[webgpu]"'
     try:
-        import wgpu
-    except ImportError:
-        raise NoDeviceError(
-            'backend="webgpu" needs the package wgpu: pip install "harnack[webgpu]"'
-        ) from None
+        wgpu = import_optional("wgpu", message)
+    except ModuleNotFoundError:
+        raise NoDeviceError(message) from None
     try:
         adapter: Any = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
     except RuntimeError as error:
@@ -104,10 +104,8 @@ class CompiledShader:
     shader: Shader
     pipeline: Any
 
-    def run(
-        self, data: Mapping[str, Any], lanes: Mapping[str, Any], count: int
-    ) -> dict[str, Words]:
-        """Run the shader on `count` lanes. Returns the results by label, each as the 32 bits of its
+    def run(self, data: Mapping[str, Any], lanes: Mapping[str, Any]) -> dict[str, Words]:
+        """Run the shader on all lanes. Returns the results by label, each as the 32 bits of its
         numbers, (count,).
 
         data: the numbers and tables that the shader reads, by label.
@@ -116,14 +114,30 @@ class CompiledShader:
         The lanes are computed in batches whose size is adapted so that each takes a fraction of a
         second.
         """
-        packed = pack_shader_data(self.shader, data)
-        lane_words = np.stack([as_words(lanes[label]) for label in self.shader.lanes])
+        lane_words = [as_words(lanes[label]) for label in self.shader.lanes]
+        results = self.run_words(pack_shader_data(self.shader, data), np.stack(lane_words))
+        return dict(zip(self.shader.results, results, strict=True))
+
+    def run_words(self, data: Words, lanes: Words) -> Words:
+        """Do what `run` does with arrays that are packed already. Returns the bits of the results,
+        (number of results, count).
+
+        data: the buffer of numbers and tables, as `pack_shader_data` returns it.
+        lanes: (number of arrays, count) the bits of each array with an entry per lane.
+        """
+        import wgpu
+
+        usage = wgpu.BufferUsage
+        data_buffer = self.device.handle.create_buffer_with_data(
+            data=data, usage=usage.STORAGE | usage.COPY_DST
+        )
+        count = lanes.shape[1]
         results = np.empty((len(self.shader.results), count), np.uint32)
         start, batch_size = 0, _INITIAL_BATCH
         while start < count:
             end = min(start + batch_size, count)
             start_time = time.perf_counter()
-            results[:, start:end] = self._dispatch(packed, lane_words[:, start:end])
+            results[:, start:end] = self._dispatch(data_buffer, lanes[:, start:end])
             elapsed = time.perf_counter() - start_time
             # Long computations may block the display, and short ones waste time on their start.
             if elapsed < _MIN_DISPATCH_SECONDS and batch_size < _MAX_BATCH:
@@ -131,25 +145,25 @@ class CompiledShader:
             elif elapsed > _MAX_DISPATCH_SECONDS and batch_size > WORKGROUP:
                 batch_size //= 2
             start = end
-        return dict(zip(self.shader.results, results, strict=True))
+        data_buffer.destroy()
+        return results
 
-    def _dispatch(self, data: Words, lanes: Words) -> Words:
+    def _dispatch(self, data_buffer: Any, lanes: Words) -> Words:
         """Run the shader on all of these lanes at once. Returns the bits of its results, (number of
         results, count).
 
-        data: the buffer of numbers and tables, as `pack_shader_data` returns it.
+        data_buffer: the numbers and tables on the device.
         lanes: (number of arrays, count) the bits of each array with an entry per lane.
         """
         import wgpu
 
         handle, usage = self.device.handle, wgpu.BufferUsage
         count = lanes.shape[1]
-        data = data.copy()
         # The first word of the data is the number of lanes.
-        data[0] = count
+        handle.queue.write_buffer(data_buffer, 0, np.array([count], np.uint32))
         result_bytes = 4 * count * len(self.shader.results)
         buffers = [
-            handle.create_buffer_with_data(data=data, usage=usage.STORAGE),
+            data_buffer,
             handle.create_buffer_with_data(data=np.ascontiguousarray(lanes), usage=usage.STORAGE),
             handle.create_buffer(size=result_bytes, usage=usage.STORAGE | usage.COPY_SRC),
         ]
@@ -168,7 +182,7 @@ class CompiledShader:
         compute_pass.end()
         handle.queue.submit([encoder.finish()])
         result_words: Words = np.frombuffer(handle.queue.read_buffer(buffers[2]), dtype=np.uint32)
-        for buffer in buffers:
+        for buffer in buffers[1:]:
             buffer.destroy()
         return result_words.reshape(-1, count)
 
@@ -242,7 +256,7 @@ def evaluate_on_device(
     )
     compiled = device.compile(recording.shader)
     lane_arrays = {label: to_numpy(array) for label, array in labeled_leaves("lane", dict(lanes))}
-    bits = compiled.run(recording.data, lane_arrays, count)
+    bits = compiled.run(recording.data, lane_arrays)
     expected: Arrays = {}
     results: Arrays = {}
     for label, array in recording.results.items():

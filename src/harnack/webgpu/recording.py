@@ -15,7 +15,7 @@ import contextlib
 import dataclasses
 import functools
 import gc
-import io
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
@@ -102,7 +102,8 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
         _garbage_collection_paused(),
         dr.scoped_set_flag(dr.JitFlag.KernelHistory, True),
         dr.scoped_set_flag(dr.JitFlag.PrintIR, True),
-        contextlib.redirect_stdout(io.StringIO()),  # the flag also prints the kernel
+        # The flag also prints the kernel, in this thread.
+        contextlib.redirect_stdout(cast("Any", _SilencedThread(sys.stdout))),
     ):
         dr.kernel_history_clear()
         dr.eval(arrays)
@@ -110,6 +111,21 @@ def _evaluate_and_get_ir(arrays: list[Any]) -> str:
     if len(kernels) != 1:
         raise RuntimeError(f"this computation is {len(kernels)} kernels, and not one")
     return kernels[0]["ir"].getvalue()
+
+
+class _SilencedThread:
+    """A stream that drops what the thread that made it writes, and passes on to `stream` all that
+    other threads write."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._thread = stream, threading.get_ident()
+
+    def write(self, text: str) -> int:
+        """Write a text, unless this is the silenced thread."""
+        return len(text) if threading.get_ident() == self._thread else self._stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 @contextlib.contextmanager
@@ -153,16 +169,18 @@ class _ArrayLabels:
 
     @contextlib.contextmanager
     def label_gathers(self) -> Generator[None]:
-        """Context manager within which the result of each `drjit.gather` gets the label of the
-        array that was read. It replaces the function `drjit.gather` meanwhile."""
+        """Context manager within which the result of each `drjit.gather` of this thread gets the
+        label of the array that was read. It replaces the function `drjit.gather` meanwhile, which
+        does for other threads what it always does."""
         module = cast("Any", dr)
-        original = module.gather
+        original, thread = module.gather, threading.get_ident()
 
         def gather(dtype: Any, source: Any, index: Any, *args: Any, **kwargs: Any) -> Any:
-            """Call `drjit.gather` with these arguments, and label its result. source: the array
-            that is read."""
+            """Call `drjit.gather` with these arguments, and label its result if this thread
+            records. source: the array that is read."""
             gathered = original(dtype, source, index, *args, **kwargs)
-            if dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1:
+            is_array = dr.is_array_v(type(source)) and dr.depth_v(type(source)) == 1
+            if is_array and threading.get_ident() == thread:
                 self._label_gathered(gathered, source)
             return gathered
 

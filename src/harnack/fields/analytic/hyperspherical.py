@@ -39,6 +39,7 @@ from harnack.fields.analytic.sphere_bounds import (
     value_bound,
 )
 from harnack.fields.field import Field, validate_levels_in_range
+from harnack.fields.parameters import record_call
 from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry.clip_volumes import Ball
 from harnack.geometry.volume import check_volume
@@ -163,6 +164,7 @@ class HypersphericalHarmonic(Field):
     is_cheap = True
     over_relaxation = 1.6
     is_global = True
+    _coefficients: Monomials  # of `from_polynomial` only
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
         """Check l, j and m, and set up the function with this single term."""
@@ -206,6 +208,8 @@ class HypersphericalHarmonic(Field):
             terms[a, b, c, d] = terms.get((a, b, c, d), 0.0) + float(value)
         field = cls.__new__(cls)
         field._initialize(*from_monomials(terms), domain)
+        field._coefficients = terms
+        record_call(field, (terms,), {"domain": domain}, "from_polynomial")
         return field
 
     def _initialize(self, l: int, weights: SphereWeights, domain: Volume | None) -> None:  # noqa: E741

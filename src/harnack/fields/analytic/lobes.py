@@ -27,6 +27,7 @@ from harnack.fields.analytic.solid_harmonics import (
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.field import Field, Sample
+from harnack.fields.parameters import record_call
 from harnack.fields.samples import RaySample, space_scaled
 from harnack.geometry.clip_volumes import Ball
 from harnack.name_suggestions import is_one_of
@@ -113,6 +114,7 @@ class Lobes(Field):
         """
         field = cls.__new__(cls)
         field._initialize(weights, scale, sign)
+        record_call(field, (weights,), {"scale": scale, "sign": sign}, "combined")
         return field
 
     def _initialize(self, weights: Any, scale: Any, sign: LobeSign) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
@@ -195,6 +195,21 @@ def _integer(value: Any) -> int:
     return int(number)
 
 
+def copied_arguments(**arguments: Any) -> dict[str, Any]:
+    """Arguments of `make_branches` by name, with lists, mappings and arrays copied, so that a field
+    can keep them."""
+
+    def copied(value: Any) -> Any:
+        """A copy of a list, a mapping or an array; the value itself otherwise."""
+        if isinstance(value, Mapping):
+            return dict(cast("Mapping[Any, Any]", value))
+        if isinstance(value, np.ndarray):
+            return cast("Any", value).copy()
+        return tuple(cast("Any", value)) if isinstance(value, list | Iterator) else value
+
+    return {name: copied(value) for name, value in arguments.items()}
+
+
 def _user_branches(
     function: Any, singular_points: Any, second_bound: Any, period: Any
 ) -> UserBranches:
@@ -335,14 +350,15 @@ class LevelCurves(Field):
         if part not in ("imag", "real"):
             raise ValueError(f'part must be "real" or "imag", not {part!r}')
         self.part = part
-        self.branches: Branches = make_branches(
-            function,
+        self._branch_arguments = copied_arguments(
+            function=function,
             exponent=exponent,
             argument=argument,
             singular_points=singular_points,
             second_bound=second_bound,
             period=period,
         )
+        self.branches: Branches = make_branches(**self._branch_arguments)
         if self.branches.count > 1:
             raise ValueError(
                 f"level curves need a function with one branch, and this one has "
@@ -352,6 +368,10 @@ class LevelCurves(Field):
         self.default_level = as_finite(level, "level")
         shift = self.branches.period(part == "imag")
         self.period = shift  # pyright: ignore[reportAttributeAccessIssue]
+
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name, those of the function as they were given."""
+        return {**super().constructor_arguments(), **self._branch_arguments}
 
     def prepare(self, backend: Backend) -> LevelCurves:
         """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need

@@ -26,7 +26,7 @@ from harnack.enclosures.extremum import BranchPointEnclosure, BranchSample, Near
 from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_of, derivatives
-from harnack.fields.analytic.plane import make_branches
+from harnack.fields.analytic.plane import copied_arguments, make_branches
 from harnack.fields.field import Field
 from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.geometry.clip_volumes import Ball, Box, VolumeIntersection
@@ -180,14 +180,15 @@ class RiemannSurface(Field):
             raise ValueError("height must be a factor other than 0")
         self.part = part
         self.height = float(height)
-        self.branches: Branches = make_branches(
-            function,
+        self._branch_arguments = copied_arguments(
+            function=function,
             exponent=exponent,
             argument=argument,
             singular_points=singular_points,
             second_bound=second_bound,
             period=period,
         )
+        self.branches: Branches = make_branches(**self._branch_arguments)
         radius = {"log": 4.0, "asin": 2.0}.get(function, 1.0) if isinstance(function, str) else 1.0
         self.domain = Ball(radius=radius) if domain is None else domain
         self._height: Any = self.height
@@ -198,6 +199,10 @@ class RiemannSurface(Field):
         self.has_creases = not self._is_single
         if self._is_single:
             self.period = self._shift  # pyright: ignore[reportAttributeAccessIssue]
+
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name, those of the function as they were given."""
+        return {**super().constructor_arguments(), **self._branch_arguments}
 
     def prepare(self, backend: Backend) -> RiemannSurface:
         """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need

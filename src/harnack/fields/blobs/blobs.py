@@ -56,6 +56,7 @@ from harnack.fields.blobs.group_maximum import (
 )
 from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
 from harnack.fields.formula import Formula, is_jet
+from harnack.fields.parameters import record_arguments
 from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
@@ -553,6 +554,7 @@ class Molecule(Blobs):
     ) -> None:
         """Read the atoms, and set up a blob with a Gaussian kernel for each."""
         self.atoms = source if isinstance(source, Atoms) else read_molecule(source)
+        record_arguments(self, source=self.atoms)  # so that `replace` reads no file
         super().__init__(
             self.atoms.positions, self.atoms.radii, kernel=GaussianKernel(sharpness, tail)
         )

@@ -117,9 +117,7 @@ class FieldWithCells(Field):
         build: a function that builds the cells.
         """
         key = backend, self.max_bytes(), self.finer_cells
-        if key not in self._built:
-            self._built[key] = build()
-        return self._built[key]
+        return self._built.get_or_make(key, build)
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:

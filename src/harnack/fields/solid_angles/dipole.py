@@ -28,6 +28,7 @@ from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_positive, as_real, no_derivatives
 from harnack.fields.batched_fields import PointValues, SymmetricMatrix, sharpened
+from harnack.fields.capabilities import Boundary
 from harnack.fields.clearance import (
     UnitFrame,
     VariableAccuracyField,
@@ -36,6 +37,7 @@ from harnack.fields.clearance import (
     round_to_single,
 )
 from harnack.fields.field import Sample, space_scaled
+from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.cell_options import FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
 from harnack.fields.solid_angles.dipole_cells import DipoleCells, build_cells
@@ -54,7 +56,6 @@ from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, 
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Self
 
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.backend.record_table import RecordTable
@@ -127,7 +128,7 @@ class DipoleTree:
     @property
     def coarsest_accuracy(self) -> float:
         """The smallest accuracy scale that makes a difference: a smaller one gives the same samples
-        (`Field.coarsest_accuracy`). It is 1 if there are cells, which have a single accuracy."""
+        (`VariableAccuracy.coarsest`). It is 1 if there are cells, which have a single accuracy."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
@@ -135,7 +136,7 @@ class DipoleTree:
 
         x: (3, n).
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-        closer: the accuracy scale (`Field.at_accuracy`); larger is more accurate. A number below 1
+        closer: the accuracy scale (`VariableAccuracy`); larger is more accurate. A number below 1
             counts as 1.
         """
         unit, detail = (
@@ -380,6 +381,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.fit_report: dict[str, Any] = {}
         if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
+            # What `replace` changes is the denoised cloud.
+            record_arguments(self, normals=normals, smoothing=smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
         # 1.0 is only a valid number for the check, if areas are still to be estimated.
@@ -628,11 +631,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         construction costs."""
         return _FINER_PAYS_PER_POINT * len(self.points)
 
-    def prepare(self, backend: Backend) -> Self:
-        prepared = super().prepare(backend)
-        if prepared._device is not None:
-            prepared.coarsest_accuracy = prepared._device.tree.coarsest_accuracy
-        return prepared
+    def _coarsest_accuracy(self) -> float:
+        return 1.0 if self._device is None else self._device.tree.coarsest_accuracy
 
     def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
         """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
@@ -664,10 +664,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         return Box(low - margin, high + margin)
 
     @property
-    def singular_points(self) -> FloatArray:
-        """The points (n, 3) at which f is singular: all points whose area is positive, or none if
-        the sum is smoothed."""
-        return np.zeros((0, 3)) if self.smoothing else self.points[self.areas > 0]
+    def boundary(self) -> Boundary | None:
+        """The points at which f is singular, to which all level sets come near: those whose area is
+        positive. None if the sum is smoothed."""
+        return None if self.smoothing else Boundary(points=self.points[self.areas > 0])
 
     @property
     def smoothing(self) -> float:

@@ -21,8 +21,8 @@ from harnack.geometry.meshes import MeshError, validate_mesh
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from harnack.backend import Backend, Mask, Precision, Real, Vec3
-    from harnack.fields.capabilities import JumpCrossing, NearestFacet
+    from harnack.backend import Backend, Precision, Real, Vec3
+    from harnack.fields.capabilities import Jumps, VariableAccuracy
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -92,7 +92,8 @@ class Morph(BatchedField):
         if not 2 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         self.w, self.gap = float(w), float(gap)
-        meshes = [_checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")]
+        self._mesh_a, self._mesh_b = _checked(mesh_a, "mesh_a"), _checked(mesh_b, "mesh_b")
+        meshes = self._mesh_a, self._mesh_b
         # At an end of the gap the field is the winding number of the mesh that lies there.
         self._slice: MorphSlice | WindingNumber
         if 0 < w < gap:
@@ -102,10 +103,6 @@ class Morph(BatchedField):
             )
         else:
             self._slice = WindingNumber(*meshes[int(w > 0)])
-        self.has_jumps, self.has_variable_accuracy = (
-            self._slice.has_jumps,
-            self._slice.has_variable_accuracy,
-        )
 
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
@@ -145,14 +142,16 @@ class Morph(BatchedField):
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         return self._slice.values_at(x, derivatives, closer)
 
-    def at_accuracy(self, detail: Real) -> Field:
-        return self._slice.at_accuracy(detail)
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        return self._slice.variable_accuracy
+
+    @property
+    def jumps(self) -> Jumps | None:
+        return self._slice.jumps
 
     def for_ray_count(self, count: int) -> Field:
         return self._slice.for_ray_count(count)
-
-    def without_jumps(self) -> Field | None:
-        return self._slice.without_jumps()
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         self._slice.validate_levels(levels)
@@ -162,30 +161,6 @@ class Morph(BatchedField):
 
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
         return self._slice.occupied_cells(levels)
-
-    def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        return self._slice.jump_mesh()
-
-    def next_jump(
-        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
-    ) -> JumpCrossing:
-        return self._slice.next_jump(o, d, after, t_max, active)
-
-    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        return self._slice.initial_offset(o, d, t_min, active)
-
-    def continuation(
-        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> Field:
-        return self._slice.continuation(o, d, behind, ahead, offset)
-
-    def distance_to_jumps(self, p: Vec3) -> Real:
-        return self._slice.distance_to_jumps(p)
-
-    def nearest_facet(
-        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestFacet | None:
-        return self._slice.nearest_facet(p, after, limit, active)
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:

@@ -560,11 +560,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
     def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
         """Compute, once, the cells of a grid over the extent that may contain a point of a level
         set. The other cells are proved to contain none; rays skip them."""
-        if levels not in self._occupied:
-            self._occupied[levels] = occupied_cells(
-                self, levels, self.extent(levels), _CELLS_ACROSS
-            )
-        return self._occupied[levels]
+        return self._occupied.get_or_make(
+            levels, lambda: occupied_cells(self, levels, self.extent(levels), _CELLS_ACROSS)
+        )
 
 
 @dataclass(frozen=True)

@@ -486,6 +486,17 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         """The positions (n, 3) of the vertices."""
         return self.faces.vertices
 
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name. A face is a list of loops, or a single loop."""
+        faces: list[list[list[int]]] = [[] for _ in range(self.faces.face_count)]
+        loops = np.split(self.faces.corners, self.faces.loop_starts[1:])
+        for owner, loop in zip(self.faces.face_of_loop, loops, strict=True):
+            faces[owner].append(loop.tolist())
+        return {
+            "vertices": self.vertices,
+            "faces": [face if len(face) > 1 else face[0] for face in faces],
+        }
+
     @property
     def edges(self) -> IntArray:
         """Pairs (e, 2) of indices of vertices that an edge of some face joins. Each pair occurs
@@ -508,9 +519,7 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         levels: values of the solid angle; None for the levels of this mesh.
         """
         levels = self.levels if levels is None else levels
-        if levels not in self._boxes:
-            self._boxes[levels] = face_boxes(self.faces, levels)
-        return self._boxes[levels]
+        return self._boxes.get_or_make(levels, lambda: face_boxes(self.faces, levels))
 
     def evaluate(self, p: Vec3) -> NoReturn:
         """Not defined: there is a function for each face, but none for the mesh. Always raises

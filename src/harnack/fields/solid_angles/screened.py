@@ -54,6 +54,7 @@ from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.capabilities import VariableAccuracy
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
@@ -337,7 +338,6 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         self.method: Literal["sum", "tree"] = (
             ("sum" if is_small else "tree") if method == "auto" else method
         )
-        self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         # Half the longest side of the box; more for few points that stand for large areas.
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
@@ -459,6 +459,11 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             *frame_parameters(backend, self._center, self._size), kernel, dipoles
         )
 
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        """How the field is sampled with another accuracy; None if all points are summed."""
+        return super().variable_accuracy if self.method == "tree" else None
+
     def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
         """A sample of w at points p in user coordinates: value, gradient, errors and proved bounds
         of w near p. At a dipole itself the value is 0 and the gradient is so steep that p counts as
@@ -504,9 +509,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         falls with D, so there is no level beyond the D at which it is the smallest |level|. Cells
         of that box that are proved empty are removed (`tight_extent`).
         """
-        if levels not in self._extents:
-            self._extents[levels] = self._extent(levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(levels, lambda: self._extent(levels))
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         """Compute the volume that `extent` returns and caches; None for level 0. The distance D of

@@ -129,7 +129,7 @@ class SmoothedSum:
 
     @property
     def coarsest_accuracy(self) -> float:
-        """The smallest accuracy scale that makes a difference (`Field.coarsest_accuracy`): 1."""
+        """The smallest accuracy scale that makes a difference (`VariableAccuracy.coarsest`): 1."""
         return 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:

@@ -28,7 +28,7 @@ from harnack.backend.validation import check_length_range
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
-from harnack.fields.capabilities import EXACT
+from harnack.fields.capabilities import Boundary, VariableAccuracy
 from harnack.fields.clearance import (
     DeviceField,
     UnitFrame,
@@ -61,7 +61,7 @@ from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
 from harnack.fields.solid_angles.trail_sums import RayLine, line_rates, lipschitz_along
 from harnack.fields.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.geometry import Circle, ConvexHull, is_convex_position, total_length
-from harnack.geometry.curves import CurveShapeError, Loops, cancel_opposite_circles, validate_curves
+from harnack.geometry.curves import CurveError, Loops, cancel_opposite_circles, validate_curves
 from harnack.geometry.polygons import cancel_opposite_edges, remaining_edges
 from harnack.name_suggestions import did_you_mean
 
@@ -149,6 +149,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
     over_relaxation: float = 1.3  # by experiment
+    has_parameter_derivatives: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -187,7 +188,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
                 "NumPy arrays, or no cells"
             )
-        self.has_variable_accuracy = bool(cells) and bool(self._net_loops)
+        self._has_cells = bool(cells) and bool(self._net_loops)
         self._detail: Real = 1.0
 
     @property
@@ -204,10 +205,17 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         return not self._net_loops and not self._net_circles
 
     @property
-    def boundary_curves(self) -> tuple[FloatArray, ...]:
-        """The curve as a tuple of closed polygons (n, 3), without edges that cancel each other.
-        Each circle is replaced by a polygon with many sides."""
-        return (*self._net_loops, *(circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles))
+    def boundary(self) -> Boundary | None:
+        """The curve, as closed polygons (n, 3) without edges that cancel each other. Each circle is
+        replaced by a polygon with many sides. None if all edges and circles cancel."""
+        if self._all_cancel:
+            return None
+        circles = (circle.polygon(_CIRCLE_SIDES) for circle in self._net_circles)
+        return Boundary(
+            (*self._net_loops, *circles),
+            closest_point=self._closest_on_curve,
+            continuous_change=None if self._net_circles else self._continuous_change,
+        )
 
     def _points_around(self) -> FloatArray:
         """Points (n, 3) whose convex hull contains the curve: the vertices of loops, and the
@@ -298,7 +306,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # For circles alone: the last operations, as in `LoopEdges.rounding`.
         value_rounding = 16 * backend.machine_epsilon if edges is None else edges.rounding(records)
         cells = None
-        if self.has_variable_accuracy and traced:
+        if self._has_cells and traced:
             low, high = self._box(center)
             cells = build_curve_cells(backend, unit, low, high, self.max_bytes())
         # The number of roundings of a position: `_CurveData.rounding` lists them.
@@ -326,7 +334,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
         """The same field without FMM cells; this field itself if it has none."""
-        if not self.has_variable_accuracy:
+        if not self._has_cells:
             return self
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
@@ -342,19 +350,18 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     ) -> npt.NDArray[Any]:
         """Evaluate the field at points (n, 3), and return what the function `choose` takes from
         each sample, such as its value. A field with FMM cells uses the same field without cells,
-        because values at points are sums over all edges. precision: "single" or "double"; None for
-        that of the points."""
-        if self.has_variable_accuracy:
+        because values at points are sums over all edges."""
+        if self._has_cells:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
 
-    def exact(self, backend: Backend) -> Field:
-        """The same field with samples from all edges, without the truncation error of FMM cells."""
-        return self.at_accuracy(backend.Float(EXACT)) if self.has_variable_accuracy else self
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        return VariableAccuracy(self._at_accuracy) if self._has_cells else None
 
-    def at_accuracy(self, detail: Real) -> Field:
-        """The same field with samples of the accuracy scale `detail`. Samples come from FMM cells
-        at scales up to 1, and from all edges at larger ones, which are more accurate."""
+    def _at_accuracy(self, detail: Real) -> Field:
+        """The same field with samples of this accuracy scale. Samples come from FMM cells at scales
+        up to 1, and from all edges at larger ones, which are more accurate."""
         field = copy.copy(self)
         field._detail = detail
         return field
@@ -539,11 +546,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             / data.size
         )
 
-    def closest_boundary_point(self, p: Vec3) -> Vec3 | None:
+    def _closest_on_curve(self, p: Vec3) -> Vec3:
         """The point of the curve that is closest to p, in user coordinates. Edges that cancel each
-        other do not count (`remaining_edges`); None if no edge is left."""
-        if self._all_cancel:
-            return None
+        other do not count (`remaining_edges`)."""
         data = self._data_for(p)
         x = data.to_unit(p)
         # The closest point so far, in unit coordinates, and its squared distance.
@@ -558,10 +563,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             nearest = dr.select(circle_square < square, circle_point, nearest)
         return nearest * data.size + data.center
 
-    def parameters(self) -> tuple[Any, ...]:
-        """The loops that were given as Dr.Jit arrays or tensors, by whose vertices values can be
-        differentiated. The tuple is empty if there are none."""
-        return tuple(loop for loop in self._differentiable_loops if _is_drjit(loop))
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name. `loops` has the polygons first, those that are
+        Dr.Jit arrays as they were given, and then the circles."""
+        loops = (*(self._differentiable_loops or self._loops), *self.circles)
+        return {**super().constructor_arguments(), "loops": loops}
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
@@ -580,11 +586,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             sums = data.circles.sums(data.to_unit(q))
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
 
-    def continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray | None:
+    def _continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray:
         """The change (n,) of the solid angle along the segments from points p (n, 3) to q (n, 3),
-        followed continuously, so that it may exceed 4 pi. None if there are circles."""
-        if self._net_circles:
-            return None
+        followed continuously, so that it may exceed 4 pi. It is for curves without circles."""
         backend = choose_backend("double")
         data = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
         if data.edges is None:
@@ -623,9 +627,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         L/sqrt(l (4 pi - l)) of the curves. Cells of the box with this margin that are proved to
         contain no level are then cut away (`tight_extent`).
         """
-        if levels not in self._extents:
-            self._extents[levels] = self._extent(levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(levels, lambda: self._extent(levels))
 
     def _extent(self, levels: tuple[float, ...]) -> Volume | None:
         """Compute the volume that `extent` returns and caches; None if a level is a multiple of 4
@@ -647,9 +649,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # Curves whose vertices may move share kernels: their extent is always computed the same
         # way.
         is_in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
-        if (
-            is_in_hull and self.has_variable_accuracy
-        ):  # some half-spaces of the hull: all of it lies in them
+        if is_in_hull and self._has_cells:  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
             planes = slice(_MAX_PLANES)
             return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
@@ -668,7 +668,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     def with_cells(self, cells: bool = True) -> Self:
         """The same field with FMM cells, or without them if `cells` is False."""
         field = super().with_cells(cells)
-        field.has_variable_accuracy, field._extents = cells, TransientCache()
+        field._has_cells, field._extents = cells, TransientCache()
         return field
 
     def cells_pay_from(self) -> float:
@@ -924,8 +924,7 @@ def _movable_loops(loops: Any) -> tuple[Any, tuple[Any, ...]]:
     if not any(map(_is_drjit, parts)):
         return loops, ()
     parts = [
-        tensor_to_vectors(loop, "a loop", CurveShapeError) if is_tensor(loop) else loop
-        for loop in parts
+        tensor_to_vectors(loop, "a loop", CurveError) if is_tensor(loop) else loop for loop in parts
     ]
     curves = [to_numpy(loop) if _is_drjit(loop) else loop for loop in parts]
     movable = tuple(loop for loop in parts if not isinstance(loop, Circle))

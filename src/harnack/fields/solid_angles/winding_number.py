@@ -34,7 +34,14 @@ from harnack.backend.validation import as_integer_in_range, as_real, no_derivati
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
 from harnack.fields.batched_fields import BatchedField, PointValues
-from harnack.fields.capabilities import NO_FACET, JumpCrossing, NearestFacet
+from harnack.fields.capabilities import (
+    NO_FACET,
+    JumpCrossing,
+    Jumps,
+    ModuloOne,
+    NearestFacet,
+    VariableAccuracy,
+)
 from harnack.fields.clearance import (
     DeviceField,
     UnitFrame,
@@ -61,6 +68,7 @@ from harnack.tree.closest_triangles import (
 from harnack.tree.triangle_tree import RayFrame, TriangleTree
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from typing import Self
 
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -110,7 +118,6 @@ class WindingModuloOne(Field):
     """
 
     period: ClassVar[float | None] = 1.0
-    has_variable_accuracy = True
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
         """The parameter `winding` is described at the class."""
@@ -126,9 +133,12 @@ class WindingModuloOne(Field):
         """A coarsest sample of w minus an unknown integer at points p."""
         return self._winding.evaluate_modulo_one(p)
 
-    def at_accuracy(self, detail: Real) -> Field:
-        """The same field with samples of the accuracy scale `detail`; larger is more accurate."""
-        return EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, detail))
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        """How the field is sampled with another accuracy."""
+        return VariableAccuracy(
+            lambda scale: EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, scale))
+        )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of w; None if there is no bounded
@@ -282,7 +292,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     period: ClassVar[float | None] = None
     default_level: float = 0.5
     is_larger_inside = True
-    has_jumps: bool = True
 
     def __init__(
         self,
@@ -314,7 +323,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
         self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
-        self._level_of_sheets = 0.0
+        # The level that the field takes at all triangles and nowhere else; None for other fields.
+        self._level_of_sheets: float | None = None
         self._rates: TransientCache[Backend, BoundaryRates] = TransientCache()
 
     @no_derivatives
@@ -356,11 +366,10 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         index of the user's face from which it comes."""
         return self.mesh.input_face
 
-    def prepare(self, backend: Backend) -> Self:
-        """A copy with its data on a backend, for tracing."""
-        prepared = super().prepare(backend)
-        prepared.coarsest_accuracy = prepared._require_data().winding.coarsest_detail
-        return prepared
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor by name."""
+        mesh = {"vertices": self.mesh.vertices, "faces": self.mesh.input_faces}
+        return {**super().constructor_arguments(), **mesh}
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         """w at points x (3, n) in user coordinates, and its derivatives up to order `derivatives`
@@ -410,11 +419,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         data: the mesh on that backend.
         winding: the tree over the mesh's triangles, which is used where the edges are of no use.
         """
-        if data.backend not in self._rates:
-            self._rates[data.backend] = BoundaryRates.of(
-                data.backend, self.mesh, self.order, winding
-            )
-        return self._rates[data.backend]
+        return self._rates.get_or_make(
+            data.backend, lambda: BoundaryRates.of(data.backend, self.mesh, self.order, winding)
+        )
 
     def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
         """Complete results at points: enlarge their error bounds by two errors that are still
@@ -501,10 +508,16 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         return value, field.error_bound(points, precision="double")
 
     @property
-    def has_unknown_branch(self) -> bool:
-        """Whether samples along rays may give w only up to an unknown integer. It is true if the
-        field was prepared with FMM cells of edges: samples from these do."""
-        return self._device is not None and self._device.cells is not None
+    def jumps(self) -> Jumps | None:
+        """The triangles, across which w jumps."""
+        return _TriangleJumps(self, self._data_for, self._level_of_sheets)
+
+    @property
+    def modulo_one(self) -> ModuloOne | None:
+        """How w is sampled up to an unknown integer: by FMM cells of edges. None unless the field
+        was prepared with them."""
+        data = self._device
+        return None if data is None or data.cells is None else _CellSamples(self, data)
 
     def cells_pay_from(self) -> float:
         """The smallest number of rays for which FMM cells save more time than it takes to build
@@ -522,28 +535,18 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         where they cross triangles. None in three cases: the mesh has few singular edges; the
         surface is the mesh itself; or the method is "tree" and there are no FMM cells."""
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
-        if (
-            is_small
-            or self.is_of_sheets_alone(levels)
-            or (self.method != "exact" and not self.cells)
-        ):
+        if is_small or self.is_whole_surface(levels) or (self.method != "exact" and not self.cells):
             return None
         extent = self.extent(levels)
         if extent is None:  # only for the type: there always is an extent
             return None
-        if levels not in self._occupied:
-            self._occupied[levels] = winding_cells(self, extent, levels)
-        return self._occupied[levels]
+        return self._occupied.get_or_make(levels, lambda: winding_cells(self, extent, levels))
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w itself at points p, jumps included: value, gradient, errors and proved
         bounds near p. The bounds hold for the smooth continuation of w through all triangles."""
         data, frame = self._upward_rays(p)
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
-
-    def without_jumps(self) -> Field | None:
-        """This winding number modulo 1, which is continuous across triangles. It is never None."""
-        return WindingModuloOne(self)
 
     def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
         """A sample of w minus an unknown integer at points p. The integer may differ from point to
@@ -563,111 +566,28 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         from_all = _sample_at_start(data, frame, data.backend.Float(0), detail, ~is_in_cell)
         return from_all.select(is_in_cell, space_scaled(from_cells, data.size))
 
-    def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """w at points p, with its integer, on active lanes on which the FMM cell that contains p
-        determines it; NaN on all other lanes. rounding: a bound of the rounding of a coordinate of
-        p."""
-        data = self._data_for(p)
-        if data.cells is None:
-            return data.backend.Float(dr.nan)
-        x = data.to_unit(p)
-        return data.cells.value_where_known(
-            x, fmax(coordinate_rounding(x), rounding / data.size), active
-        )
-
     def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
         """The mesh on the device; and rays from the points p along z, in unit coordinates. With an
         exact method their crossings with triangles give the integer part of w."""
         data = self._data_for(p)
         return data, RayFrame.along(data.backend, data.to_unit(p), data.backend.Array3f(0, 0, 1))
 
-    def next_jump(
-        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
-    ) -> JumpCrossing:
-        """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
-        to t = t_max, with the jump of w there along the ray. Only active lanes search."""
-        data = self._data_for(o)
-        frame = RayFrame.along(data.backend, data.to_unit(o), d)
-        behind = (after.t / data.size, after.facet)
-        t, facet, sign, normal = data.rays.next_crossing(frame, behind, t_max / data.size, active)
-        # w is larger on the side opposite to the normal.
-        return JumpCrossing(t * data.size, facet, -sign, -normal)
-
-    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
-        """The signed number of triangles that each ray o + t d crosses beyond t_min: the number
-        from which the exact method follows w along the ray. It is 0 for the tree, which needs no
-        such number, and if the surface is the mesh itself."""
-        data = self._data_for(o)
-        if self.only_sheets:
-            return data.backend.Float(0)
-        frame = RayFrame.along(data.backend, data.to_unit(o), d)
-        return data.winding.crossings_ahead(frame, t_min / data.size, active)
-
-    def is_of_sheets_alone(self, levels: tuple[float, ...]) -> bool:
+    def is_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the surface of these levels is the mesh itself, all triangles and nothing else,
         because the mesh lies on its own level set (`own_sheet`). It is computed once. It is False
         for several levels."""
         if len(levels) != 1:
             return False
-        if levels not in self._own_levels:
-            self._own_levels[levels] = lies_on_own_level(self.mesh, levels[0])
-        return self._own_levels[levels]
+        return self._own_levels.get_or_make(levels, lambda: lies_on_own_level(self.mesh, levels[0]))
 
     def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
         """The field by which these levels are traced. If the surface is the mesh itself
-        (`is_of_sheets_alone`), this is a copy that has the level only at its triangles."""
-        if not self.is_of_sheets_alone(levels):
+        (`is_whole_surface`), this is a copy that has the level only at its triangles."""
+        if not self.is_whole_surface(levels):
             return self
         field = self.with_cells(False)
-        field.only_sheets, field._level_of_sheets = True, levels[0]
+        field._level_of_sheets = levels[0]
         return field
-
-    def continuation(
-        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> Field:
-        """The winding number w on each ray o + t d between the crossings `behind` and `ahead` with
-        triangles, as a field without jumps. offset: the signed number of all crossings beyond
-        `behind` on the ray."""
-        if self.only_sheets:
-            return _BesideSheets(self._data_for(o).backend, self._level_of_sheets, behind, ahead)
-        data = self._data_for(o)
-        frame = RayFrame.along(data.backend, data.to_unit(o), d)
-        start = JumpCrossing(behind.t / data.size, behind.facet, behind.jump, behind.normal)
-        return _WindingOnInterval(data, frame, start, offset)
-
-    def distance_to_jumps(self, p: Vec3) -> Real:
-        """A lower bound of the distance from p to the triangles, at which w jumps."""
-        data = self._data_for(p)
-        return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
-
-    def nearest_facet(
-        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
-    ) -> NearestFacet:
-        """The next triangle in the order of distance from p, after the triangle given by `after`,
-        on active lanes. No triangle is found (NO_FACET) where it would be farther from p than
-        `limit`. Called repeatedly, it lists the triangles by distance.
-
-        after: the squared distance in unit coordinates (`NearestFacet.sort_key`), and the index, of
-            the previous triangle.
-        limit: a length, in the user's unit.
-        """
-        data = self._data_for(p)
-        facet = next_closest_triangle(
-            data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
-        )
-        # Triangles without an area get an arbitrary normal, and count as having no inner points.
-        length = dr.norm(facet.normal)
-        up = data.backend.Array3f(0, 0, 1)
-        normal = dr.select(length > 0, facet.normal / length, up)
-        is_inner = facet.is_inner & (length > 0)
-        return NearestFacet(
-            facet.squared_distance, facet.triangle, facet.offset * data.size, normal, is_inner
-        )
-
-    def jump_mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
-        """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
-        closed. It is never None."""
-        return self.mesh.vertices, self.mesh.triangles, not len(self.mesh.singular_edges)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for level 0, the value of w outside a closed mesh, which is no
@@ -680,9 +600,9 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """A volume that is proved to contain the level sets: all triangles, and the cells around
         them that are not proved empty (`winding_extent`). It is computed once for these levels, and
         is never None."""
-        if levels not in self._extents:
-            self._extents[levels] = winding_extent(self.with_cells(False), self.mesh, levels)
-        return self._extents[levels]
+        return self._extents.get_or_make(
+            levels, lambda: winding_extent(self.with_cells(False), self.mesh, levels)
+        )
 
     def describe(self) -> dict[str, Any]:
         """Facts about the field for users, as a dictionary of names and values: the numbers of
@@ -695,6 +615,137 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             **({"corners joined by rounding": mesh.rounded} if mesh.rounded else {}),
             **self.describe_cells(None if self._device is None else self._device.built),
         }
+
+
+# Capabilities of a winding number as objects (`fields.capabilities`).
+
+
+class _TriangleJumps(Jumps):
+    """The triangles of a mesh, across which its winding number w jumps by an integer.
+
+    field: the winding number.
+    data_for: a function that returns the mesh on the device of points p.
+    level: if the mesh is the whole surface (`WindingNumber.with_levels`), the level that the field
+        takes at the triangles and nowhere else; otherwise None.
+    """
+
+    def __init__(
+        self, field: WindingNumber, data_for: Callable[[Vec3], _WindingData], level: float | None
+    ) -> None:
+        """The parameters are described at the class."""
+        self.field, self.data_for, self.level = field, data_for, level
+        self.takes_all_levels = level is not None
+
+    def next_crossing(
+        self, o: Vec3, d: Vec3, after: JumpCrossing, t_max: Real, active: Mask
+    ) -> JumpCrossing:
+        """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
+        to t = t_max, with the jump of w there along the ray."""
+        data = self.data_for(o)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        behind = (after.t / data.size, after.facet)
+        t, facet, sign, normal = data.rays.next_crossing(frame, behind, t_max / data.size, active)
+        # w is larger on the side opposite to the normal.
+        return JumpCrossing(t * data.size, facet, -sign, -normal)
+
+    def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
+        """The signed number of triangles that each ray o + t d crosses beyond t_min: the number
+        from which the exact method follows w along the ray. It is 0 for the tree, which needs no
+        such number, and if the surface is the mesh itself."""
+        data = self.data_for(o)
+        if self.takes_all_levels:
+            return data.backend.Float(0)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        return data.winding.crossings_ahead(frame, t_min / data.size, active)
+
+    def continuation(
+        self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
+    ) -> Field:
+        """The winding number w on each ray o + t d between the crossings `behind` and `ahead` with
+        triangles, as a field without jumps. offset: the signed number of all crossings beyond
+        `behind` on the ray."""
+        data = self.data_for(o)
+        if self.level is not None:
+            return _BesideSheets(data.backend, self.level, behind, ahead)
+        frame = RayFrame.along(data.backend, data.to_unit(o), d)
+        start = JumpCrossing(behind.t / data.size, behind.facet, behind.jump, behind.normal)
+        return _WindingOnInterval(data, frame, start, offset)
+
+    def distance(self, p: Vec3) -> Real:
+        """A lower bound of the distance from p to the triangles, at which w jumps."""
+        data = self.data_for(p)
+        return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
+
+    def nearest_facet(
+        self, p: Vec3, after: tuple[Real, Any], limit: Real, active: Mask
+    ) -> NearestFacet:
+        """The next triangle in the order of distance from p, after the triangle given by `after`,
+        within the distance `limit`. Called repeatedly, it lists the triangles by distance.
+
+        after: the squared distance and the index of the previous triangle.
+        """
+        data = self.data_for(p)
+        facet = next_closest_triangle(
+            data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
+        )
+        # Triangles without an area get an arbitrary normal, and count as having no inner points.
+        length = dr.norm(facet.normal)
+        up = data.backend.Array3f(0, 0, 1)
+        normal = dr.select(length > 0, facet.normal / length, up)
+        is_inner = facet.is_inner & (length > 0)
+        return NearestFacet(
+            facet.squared_distance, facet.triangle, facet.offset * data.size, normal, is_inner
+        )
+
+    def mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
+        """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
+        closed."""
+        return (
+            self.field.mesh.vertices,
+            self.field.mesh.triangles,
+            not len(self.field.mesh.singular_edges),
+        )
+
+    def smooth_field(self) -> Field | None:
+        """The winding number modulo 1, which is continuous across triangles."""
+        return WindingModuloOne(self.field)
+
+    def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
+        """Whether the surface of these levels is the mesh itself."""
+        return self.field.is_whole_surface(levels)
+
+
+class _CellSamples(ModuloOne):
+    """Samples of a winding number w from FMM cells, up to an unknown integer.
+
+    field: the winding number, prepared with FMM cells of edges.
+    data: the mesh and its cells on the backend.
+    """
+
+    def __init__(self, field: WindingNumber, data: _WindingData) -> None:
+        """The parameters are described at the class."""
+        self.field, self.data = field, data
+
+    @property
+    def sure_accuracy(self) -> float:
+        """The smallest accuracy scale at which samples give w with its integer."""
+        return self.data.winding.coarsest_detail
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """A coarsest sample of w minus an unknown integer at points p."""
+        return self.field.evaluate_modulo_one(p)
+
+    def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
+        """w at points p, with its integer, on active lanes on which the FMM cell that contains p
+        determines it; NaN on all other lanes. rounding: a bound of the rounding of a coordinate of
+        p."""
+        data = self.data
+        if data.cells is None:
+            return data.backend.Float(dr.nan)
+        x = data.to_unit(p)
+        return data.cells.value_where_known(
+            x, fmax(coordinate_rounding(x), rounding / data.size), active
+        )
 
 
 @dataclass(frozen=True)
@@ -757,21 +808,21 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """The parameters (on, frame, behind, offset, detail) are described at the class."""
-        self.has_variable_accuracy = on.winding.has_detail or on.cells is not None
-        self.coarsest_accuracy = on.winding.coarsest_detail
+        """The parameters are described at the class."""
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
     @property
-    def has_unknown_branch(self) -> bool:
-        """Whether samples may give w only up to an unknown integer: whether there are FMM cells of
-        edges."""
-        return self._on.cells is not None
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        """How the function is sampled with another accuracy. If there are FMM cells of edges,
+        coarse samples may give w only up to an unknown integer."""
+        winding, has_cells = self._on.winding, self._on.cells is not None
+        if not (winding.has_detail or has_cells):
+            return None
+        return VariableAccuracy(self._at_accuracy, winding.coarsest_detail, has_cells)
 
-    def at_accuracy(self, detail: Real) -> Field:
-        """The same function with samples of the accuracy scale `detail`; larger is more
-        accurate."""
+    def _at_accuracy(self, detail: Real) -> Field:
+        """The same function with samples of the accuracy scale `detail`."""
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -786,7 +837,7 @@ class _WindingOnInterval(Field):
         # Samples from cells leave an integer unknown. So they count as coarser than all others, and
         # serve only accuracy scales below the coarsest one.
         from_cells, is_in_cell = data.cells.sample(
-            x, frame.d, unit, detail < self.coarsest_accuracy
+            x, frame.d, unit, detail < data.winding.coarsest_detail
         )
         sample = data.winding.sample_interval(
             frame, x, self._behind, self._offset, detail, ~is_in_cell

@@ -191,8 +191,8 @@ class TreeWinding:
     @property
     def coarsest_detail(self) -> float:
         """The smallest accuracy scale that makes a difference: at smaller scales samples are the
-        same (`Field.coarsest_accuracy`). With FMM cells it is 1, up to which samples come from the
-        cells."""
+        same (`VariableAccuracy.coarsest`). With FMM cells it is 1, up to which samples come from
+        the cells."""
         return self.clusters.coarsest_accuracy if self.cells is None else 1.0
 
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
@@ -376,7 +376,7 @@ class TreeWinding:
                 return add
 
             start = tuple(self.backend.Float(0) for _ in lengths)
-            # Accuracy scale 0: the coarsest sums are enough for bounds.
+            # VariableAccuracy scale 0: the coarsest sums are enough for bounds.
             far_sums, edge_rates = self._near_sums(
                 line.x, self.backend.Float(0), adder, start, active
             )

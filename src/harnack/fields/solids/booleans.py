@@ -24,6 +24,7 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
+from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.field import Field
 from harnack.fields.formula import prepare_value, probe_jets
 from harnack.fields.samples import Ray, RaySample, Sample, value_error_bound
@@ -112,11 +113,6 @@ class BooleanSolid(Solid):
         if domains:
             domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
-        object.__setattr__(
-            self, "has_variable_accuracy", any(part.has_variable_accuracy for part in self.parts)
-        )
-        coarsest = min((part.coarsest_accuracy for part in self.parts), default=1.0)
-        object.__setattr__(self, "coarsest_accuracy", coarsest)
         # The smallest factor of all operands. A step longer than the proved one is accepted only if
         # every operand proves the rest of it, looking back from the new point. So one operand
         # without such proofs makes longer steps useless.
@@ -160,8 +156,17 @@ class BooleanSolid(Solid):
     def prepare(self, backend: Backend) -> Solid:
         return self._with_parts([part.prepare(backend) for part in self.parts])
 
-    def at_accuracy(self, detail: Real) -> Field:
-        return self._with_parts([part.at_accuracy(detail) for part in self.parts])
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        accuracies = [part.variable_accuracy for part in self.parts]
+        known = [accuracy for accuracy in accuracies if accuracy is not None]
+
+        def at(scale: Real) -> Field:
+            """The combination, with its operands sampled at this accuracy scale."""
+            pairs = zip(self.parts, accuracies, strict=True)
+            return self._with_parts([part if a is None else a.at(scale) for part, a in pairs])
+
+        return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
 
     def for_ray_count(self, count: int) -> Field:
         def make(parts: list[Any]) -> Solid:
@@ -175,8 +180,6 @@ class BooleanSolid(Solid):
         fields."""
         combination = copy.copy(self)
         object.__setattr__(combination, "parts", tuple(parts))
-        coarsest = min((part.coarsest_accuracy for part in parts), default=1.0)
-        object.__setattr__(combination, "coarsest_accuracy", coarsest)
         return combination
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

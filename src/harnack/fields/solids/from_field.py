@@ -19,7 +19,7 @@ import numpy as np
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import no_derivatives
+from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, is_jet, prepare_value
@@ -72,7 +72,7 @@ def solid(
     if len(bounds) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
-    if field.has_jumps:
+    if field.jumps is not None:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
@@ -97,10 +97,6 @@ def solid(
     lower, upper = numbers
     # Here `around` is given: lower is its level, and upper its half width.
     if around is not None:
-        if not upper > 0:
-            raise ValueError(f"half_width must be positive, not {upper:g}")
-        if field.period is not None and not 2 * upper < field.period:
-            raise ValueError(f"half_width must be below {field.period / 2:g}, half of the period")
         return BandSolid(field, lower, upper)
     if not lower < upper:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
@@ -375,6 +371,17 @@ class BandSolid(SolidOfField):
     half_width: float
 
     def __post_init__(self) -> None:
+        """Check the numbers, and take over the settings of the field.
+
+        Raises:
+            ValueError: a number is not finite, or half_width is not positive or too large.
+        """
+        as_finite(self.level, "level")
+        if not as_finite(self.half_width, "half_width") > 0:
+            raise ValueError(f"half_width must be positive, not {self.half_width:g}")
+        period = self.field.period
+        if period is not None and not 2 * self.half_width < period:
+            raise ValueError(f"half_width must be below {period / 2:g}, half of the period")
         self._copy_settings()
         domain = None if self.field.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)

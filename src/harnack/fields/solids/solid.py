@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.validation import as_positive, no_derivatives
 from harnack.cluster.serialization import TransientCache
+from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula
 from harnack.geometry import Ball, Box, Volume
@@ -298,9 +299,7 @@ class Solid(Field):
         key = tuple(map(id, variants))
         if key == tuple(map(id, parts)):
             return self
-        if key not in self._ray_count_variants:
-            self._ray_count_variants[key] = make(variants)
-        return self._ray_count_variants[key]
+        return self._ray_count_variants.get_or_make(key, lambda: make(variants))
 
     @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
@@ -367,8 +366,6 @@ class SolidOfField(Solid):
         """Copy attributes of the inner field to this solid: the settings for the tracer, and the
         further attributes with these names."""
         settings = (
-            "has_variable_accuracy",
-            "coarsest_accuracy",
             "over_relaxation",
             "min_wavelength",
             "is_cheap",
@@ -386,14 +383,17 @@ class SolidOfField(Solid):
     def prepare(self, backend: Backend) -> Solid:
         return self._with_inner(self.field.prepare(backend))
 
-    def at_accuracy(self, detail: Real) -> Field:
-        return self._with_inner(self.field.at_accuracy(detail))
+    @property
+    def variable_accuracy(self) -> VariableAccuracy | None:
+        inner: VariableAccuracy | None = self.field.variable_accuracy
+        if inner is None:
+            return None
+        return VariableAccuracy(lambda scale: self._with_inner(inner.at(scale)), inner.coarsest)
 
     def _with_inner(self, inner: Field) -> Solid:
         """The same solid made of another inner field, such as one that is prepared."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
-        object.__setattr__(solid, "coarsest_accuracy", inner.coarsest_accuracy)
         return solid
 
     def for_ray_count(self, count: int) -> Field:

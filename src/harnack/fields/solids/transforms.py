@@ -17,9 +17,11 @@ import numpy.typing as npt
 
 from harnack.arithmetic import Jet
 from harnack.backend.elementary import max_norm, safe_norm
+from harnack.backend.validation import check_no_derivatives
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.fields.formula import as_jet, hessian_error, with_device_numbers
+from harnack.fields.parameters import Parametrized
 from harnack.fields.samples import Ray, RaySample, Sample
 from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField
 from harnack.geometry import Ball, ConvexHull
@@ -32,7 +34,7 @@ from harnack.fields.solids.solid import SpaceMap, axis_index
 
 
 @dataclass(frozen=True)
-class AffineMap(SpaceMap):
+class AffineMap(SpaceMap, Parametrized):
     """The affine map u -> matrix u + translation_vector, in double precision, which can be applied
     to solids.
 
@@ -131,6 +133,18 @@ class AffineMap(SpaceMap):
         if not (np.isfinite(sizes).all() and (sizes > 0).all()):
             raise ValueError(f"factors must be positive numbers, one or three, not {factors!r}")
         return cls.of_arrays(np.diag(sizes))
+
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of `of_arrays`."""
+        return {"matrix": self.matrix, "offset": self.translation_vector}
+
+    def replace(self, **changes: Any) -> AffineMap:
+        """The map of another matrix or offset, by `of_arrays`. The factor of values changes as that
+        of the matrices does."""
+        check_no_derivatives("an AffineMap", changes)
+        old = AffineMap.of_arrays(self.matrix, self.translation_vector)
+        new = AffineMap.of_arrays(**(self.constructor_arguments() | changes))
+        return replace(new, value_factor=self.value_factor / old.value_factor * new.value_factor)
 
     def apply(self, solid: Solid) -> Solid:
         """The image of a solid under this map. If the solid is itself the image of another under an

@@ -1,9 +1,12 @@
-"""Arithmetics along paths: parabolas and affine forms enclose what they are made of, and the proofs
-made of them hit what pieces of the path hit."""
+"""The literature's arithmetics along paths: parabolas and affine forms enclose what they are made
+of, and the proofs made of them hit what pieces of the path hit."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
+from inspect import isclass
 from typing import Any
 
 import drjit as dr
@@ -13,13 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import harnack as hk
+from harnack import literature
 from harnack.arithmetic import (
-    AffineForm,
     Jet,
-    ParabolaBounds,
     absolute,
     atan2,
-    clipped_power,
     exp,
     log,
     sin,
@@ -27,18 +28,40 @@ from harnack.arithmetic import (
     tanh,
 )
 from harnack.backend import choose_backend, to_float, to_vector3
-from harnack.enclosures import LevelGaps, SlopeRange
-from harnack.enclosures.literature import (
+from harnack.enclosures import Enclosure, LevelGaps, SlopeRange, choose_enclosures
+from harnack.enclosures.selection import ENCLOSURE_NAMES
+from harnack.fields.formula import FormulaOnRay
+from harnack.literature import (
     AffineEnclosure,
+    AffineForm,
     BottomUpLinearEnclosure,
     BottomUpQuadraticEnclosure,
     IntervalEnclosure,
     LongestOfEnclosure,
+    ParabolaBounds,
+    clipped_power,
 )
-from harnack.fields.formula import FormulaOnRay
 
 Formula = Callable[[Any, Any, Any], Any]
 PROOFS = ("bottom-up-linear", "bottom-up-quadratic", "mixed", "affine", "interval")
+
+
+def test_every_enclosure_has_a_name_and_is_imported_when_it_is_asked_for() -> None:
+    chosen = {choose_enclosures(name).kinds[0] for name in ENCLOSURE_NAMES}
+    named = {kind for kind in chosen if kind.__module__.startswith("harnack.literature.")}
+    public = [getattr(literature, name) for name in literature.__all__]
+    assert named == {kind for kind in public if isclass(kind) and issubclass(kind, Enclosure)}
+    assert len(named) == 8
+    code = """
+import sys
+from harnack.enclosures import choose_enclosures
+choose_enclosures(), choose_enclosures("pieces"), choose_enclosures("classic")
+print("harnack.literature" in sys.modules)
+print(choose_enclosures("affine").kinds)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    kind = "harnack.literature.formula_enclosures.AffineEnclosure"
+    assert run.stdout.splitlines() == ["False", f"(<class '{kind}'>,)"]
 
 
 def larger(a: Any, b: Any) -> Any:

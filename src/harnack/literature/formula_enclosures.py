@@ -4,34 +4,32 @@ value at the start, at the length s; so it proves a length on which f takes no l
 rays look for.
 
 The formula is evaluated along the path in another arithmetic, operation by operation, which bounds
-f. Bounds by parabolas come from the bottom-up arithmetic of `harnack.arithmetic.ParabolaBounds`;
-bounds by two lines (bands) come from affine forms and from intervals. All of them prove steps.
-Benchmarks measure how many steps a ray takes with each.
+f. Bounds by parabolas come from the bottom-up arithmetic of `ParabolaBounds`; bounds by two lines
+(bands) come from affine forms and from intervals. All of them prove steps. Benchmarks measure how
+many steps a ray takes with each.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 
-from harnack.arithmetic import AffineForm, Interval, Jet, ParabolaBounds
+from harnack.arithmetic import Interval, Jet
 from harnack.backend.elementary import fmax, fmin
-from harnack.enclosures.enclosure import (
-    STEP_SAFETY,
-    Enclosure,
-    EvaluableRestriction,
-    LevelGaps,
-    SlopeRange,
-)
+from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, LevelGaps, SlopeRange
 from harnack.enclosures.parabola import ParabolaEnclosure
-from harnack.enclosures.piecewise_taylor import LinearTaylorEnclosure, QuadraticTaylorEnclosure
+from harnack.fields.formula import FormulaOnRay
+from harnack.literature.affine_forms import AffineForm
+from harnack.literature.parabola_bounds import ParabolaBounds
+from harnack.literature.taylor_forms import LinearTaylorEnclosure, QuadraticTaylorEnclosure
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Real
     from harnack.enclosures.enclosure import PathRestriction
 
 
@@ -58,9 +56,12 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
         slopes: the range of the derivative at the start of the path; not used.
         length: the length of the piece.
         """
-        if not isinstance(function, EvaluableRestriction):
+        if not isinstance(function, FormulaOnRay):
             return None
-        parabolas = _parabolas(function, length, cls.degree)
+        parabolas = _evaluate(
+            function,
+            ParabolaBounds.along_ray(function.p, function.direction, length, degree=cls.degree),
+        )
         # The change of f lies between a s + b s^2 and c s + d s^2.
         (a, b), (c, d) = parabolas.bounds
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
@@ -180,9 +181,9 @@ class AffineEnclosure(BandEnclosure):
         An affine form is center + slope e + error, with e from -1 at the start of the path to 1 at
         its end. So f rises by 2 slope on the length, and starts at center - slope.
         """
-        if not isinstance(function, EvaluableRestriction):
+        if not isinstance(function, FormulaOnRay):
             return None
-        form = function.evaluate_with(lambda p, d: AffineForm.along_ray(p, d, length))
+        form = _evaluate(function, AffineForm.along_ray(function.p, function.direction, length))
         # The bounds are of the change of f, so the value at the start is subtracted.
         start = _value(function)
         rate = 2 * form.slope / length
@@ -209,26 +210,25 @@ class IntervalEnclosure(BandEnclosure):
         function: f along the path. slopes: the range of its derivative at the start; not used.
         length: the length of the piece of the path.
         """
-        if not isinstance(function, EvaluableRestriction):
+        if not isinstance(function, FormulaOnRay):
             return None
-        jet = function.evaluate_with(lambda p, d: Jet.along_ray(p, d, 0.0, length, anchored=False))
+        # Without the jets at the start of the path, from which ranges would be narrowed.
+        x, y, z = (
+            dataclasses.replace(coordinate, jet_at_start=None)
+            for coordinate in Jet.along_ray(function.p, function.direction, 0.0, length)
+        )
+        jet = _evaluate(function, (x, y, z))
         zero = 0 * length
         return cls(jet.value - _value(function), SlopeRange(zero, zero), length)
 
 
-def _parabolas(function: EvaluableRestriction, length: Real, degree: int) -> ParabolaBounds:
-    """Return bounds of the function along the path, by lines (degree 1) or parabolas (degree 2)."""
-    return function.evaluate_with(
-        lambda p, d: ParabolaBounds.along_ray(p, d, length, degree=degree)
-    )
-
-
-def _value(function: EvaluableRestriction) -> Interval:
+def _value(function: FormulaOnRay) -> Interval:
     """Return the range of f at the start of the path, from the formula evaluated with intervals."""
+    return _evaluate(function, Jet.at_point(function.p)).value
 
-    def at_start(p: Vec3, direction: Vec3) -> tuple[Jet, Jet, Jet]:
-        """Return the coordinates of the start of the path."""
-        del direction
-        return Jet.at_point(p)
 
-    return function.evaluate_with(at_start).value
+def _evaluate(function: FormulaOnRay, coordinates: tuple[Any, Any, Any]) -> Any:
+    """Return the value of a formula at coordinates that are numbers of any arithmetic, as a number
+    of that arithmetic."""
+    value = function.field.formula(*coordinates)
+    return coordinates[0].constant(float(value)) if isinstance(value, int | float) else value

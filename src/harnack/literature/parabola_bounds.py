@@ -24,11 +24,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
-from harnack.arithmetic.angles import angle_range, approximate_direction, meets_branch_cut
-from harnack.arithmetic.functions import ClippedPower, atan, reciprocal
+from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.interval import Interval, machine_epsilon
 from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import clamp, fmax, fmin
+from harnack.literature.blob_kernel import ClippedPower
+from harnack.literature.relative_angle import relative_angle
 
 if TYPE_CHECKING:
     from harnack.arithmetic.functions import ElementaryFunction
@@ -335,7 +336,7 @@ class ParabolaBounds(FormulaNumber):
         )
         # The slopes of the chords of phi from f(0) to the smallest and to the largest value of f.
         chords = [
-            ((function.ranges(start.shifted(x))[0] - value) * Interval.point(x).reciprocal())
+            ((function.ranges(start + Interval(x, x))[0] - value) * Interval.point(x).reciprocal())
             for x in (min_change, max_change)
         ]
         slope_to_min, slope_to_max = (bound.intersect(slopes) for bound in chords)
@@ -434,22 +435,14 @@ class ParabolaBounds(FormulaNumber):
 
     def polar_angle(self, x: Any) -> ParabolaBounds:
         """The polar angle atan2(y, x) of the point z = (x, y), where y is this function and x
-        another one. Its change along the path is that of the angle relative to a fixed direction c.
-
-        Proof. For any vector c = (a, b), the angle of z = (x, y) and the angle of (x a + y b, y a -
-        x b) differ by a constant along a path that does not meet the cut of the angle. Where x a +
-        y b > 0 the second angle is an arc tangent. Elsewhere nothing is known beyond the start: the
-        bounds are infinite.
-
-        In the code c is about the direction of z at the start.
+        another one. Its change along the path is that of the angle relative to a fixed direction,
+        which is about that of z at the start (`relative_angle`). Where that is not proved, nothing
+        is known beyond the start: the bounds are infinite.
         """
         h = self.piece_length
         v, u = (_on_backend(bounds.value, h) for bounds in (self, x))
         value, _ = angle_range(v, u)
-        a, b = approximate_direction(u.midpoint, v.midpoint)
-        along_c, across_c = x * a + self * b, self * a - x * b
-        relative = across_c.product(along_c.apply(reciprocal)).apply(atan)
-        is_valid = ~meets_branch_cut(self._range(), x._range()) & (along_c._range().lower > 0)
+        relative, is_valid, _, _ = relative_angle(self, x, v.midpoint, u.midpoint)
         zero = 0 * h
         return self._new(
             value,
@@ -457,7 +450,8 @@ class ParabolaBounds(FormulaNumber):
             _select(is_valid, relative.upper, (zero + dr.inf, zero)),
         )
 
-    def _range(self) -> Interval:
+    @property
+    def range(self) -> Interval:
         """The range of the function on the whole path: its value at s = 0 plus the extremes of the
         two parabolas."""
         # `min_change` is minus the smallest change.

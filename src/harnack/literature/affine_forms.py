@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.arithmetic.angles import angle_range, approximate_direction, meets_branch_cut
-from harnack.arithmetic.functions import atan, reciprocal
+from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.interval import Interval, machine_epsilon
 from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import fmax, fmin
+from harnack.literature.relative_angle import relative_angle
 
 if TYPE_CHECKING:
     from harnack.arithmetic.functions import ElementaryFunction
@@ -199,21 +199,11 @@ class AffineForm(FormulaNumber):
 
     def polar_angle(self, x: Any) -> AffineForm:
         """The polar angle atan2(y, x) of the point z = (x, y), where y is this function: the angle
-        of a direction c near z, plus the angle of z relative to c.
-
-        Proof. For any vector c = (a, b), the angle of z = (x, y) is that of c plus that of (x a + y
-        b, y a - x b), up to a multiple of 2 pi. If the box of z does not meet the cut of the angle,
-        z and c lie in one of the half-planes x > 0, y > 0 and y < 0, so their angles differ by at
-        most pi. Where x a + y b > 0, the angle of the second vector is an arc tangent, less than
-        pi/2 in size. So the multiple is 0. Elsewhere only [-pi, pi] is known.
-
-        In the code c is about the direction of the middle of z's range.
+        of a direction c near the middle of z's range, plus the angle of z relative to c
+        (`relative_angle`). Where that is not proved, only [-pi, pi] is known.
         """
-        a, b = approximate_direction(x.center, self.center)
-        along_c, across_c = x * a + self * b, self * a - x * b
-        relative = across_c.product(along_c.apply(reciprocal)).apply(atan)
+        relative, is_valid, a, b = relative_angle(self, x, self.center, x.center)
         c_angle, _ = angle_range(Interval.point(b), Interval.point(a))
-        is_valid = ~meets_branch_cut(self.range, x.range) & (along_c.range.lower > 0)
         center = relative.center + c_angle.midpoint
         error = (
             relative.error
