@@ -186,9 +186,11 @@ def _job(
     shared: further shared arguments.
     """
     first = frames[0]
-    # Arguments are compared by identity: equal arrays or fields could be expensive to compare.
+    # Arguments are compared by identity: comparing the contents of arrays or fields could take
+    # long.
     varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
     shared = {**shared, **{name: first[name] for name in first if name not in varying}}
+    # `register` returns the Mitsuba module, whose variant is the one that is set now.
     return _FilmJob(shared, register().variant()), [
         ({name: frame[name] for name in varying},) for frame in frames
     ]
@@ -385,6 +387,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     # Milliseconds: GIF files count hundredths of a second, and players slow down what is faster
     # than 50 pictures a second.
     duration = 10 * max(2, round(100 / fps))
+    # loop=0: repeated for ever; disposal=2: each picture is cleared before the next one.
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, disposal=2
     )
@@ -401,9 +404,10 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
     if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
     with av.open(str(path), "w") as container:
+        # Denominators up to 1001 express the rates of television, such as 30000/1001.
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "16"}
+        stream.options = {"crf": "16"}  # high quality: 0 is lossless, and 23 the default
 
         def add(pixels: Pixels) -> None:
             """Add a picture (h, w, 3) to the film.
@@ -424,4 +428,5 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             container.mux(stream.encode(frame))
 
         yield add
+        # Without a picture, `encode` returns what the encoder still holds back.
         container.mux(stream.encode())

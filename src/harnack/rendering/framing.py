@@ -229,6 +229,7 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
                 "nothing is to be seen of this surface: its domain, clip and section do not "
                 "overlap, so that nothing is left to draw"
             )
+        # A surface that is too far from the origin has an error of its own.
         check_offset(ends)
         raise NothingVisibleError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "

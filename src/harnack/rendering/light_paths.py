@@ -291,7 +291,7 @@ def estimate_time(
         pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
-        # One path in each of these pixels.
+        # One path in each of these pixels, with 0 as the seed.
         results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
         dr.eval(results.light)
         dr.sync_thread()
@@ -404,8 +404,8 @@ class RefractionTracer:
         self.world, self.light = world, light
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
-        pairs = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
-        self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
+        pairs = ((proxy, refractive_index(mi, proxy)) for proxy in world.proxies)
+        self.indices = tuple((proxy, index) for proxy, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
         """Find the first opaque hits of camera rays, behind transparent solids. Returns
@@ -444,6 +444,7 @@ class RefractionTracer:
         a transparent solid is refracted there and goes on; any other ray ends. A ray also ends
         where it hits an isoline, and at the 33rd boundary."""
         mi, world, d = self.world.mi, self.world, hits.ray.d
+        # The segment starts at the hit of the last one.
         si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
         throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
         interface_count = hits.interface_count + 1
@@ -495,8 +496,8 @@ class RefractionTracer:
         mirrored = d - 2 * dr.dot(normal, d) * normal
         reflectance_straight_on = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
-        # Without diffuse color, only the highlight remains. It is scaled from the usual
-        # reflectance.
+        # Of a glossy black surface that nothing hides, only the highlight remains. It is scaled
+        # from the usual reflectance.
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
             reflectance_straight_on / _DEFAULT_REFLECTANCE
         )

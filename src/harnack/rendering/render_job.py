@@ -111,6 +111,7 @@ class RenderJob:
         if options.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
             aov_task = AovTask.of(mi, scene, sensor, placement, options.color_by)
+            # Of pictures of numbers, the bottom and the top of the backdrop have the same color.
             if isinstance(options.backdrop, GradientBackdrop):
                 aov_task = replace(aov_task, background=options.backdrop.bottom)
             return aov_task

@@ -262,6 +262,7 @@ class ColorScale:
             first_multiple, last_multiple = self._multiples(spacing)
         if last_multiple - first_multiple < 1:  # no room for two nice numbers
             largest = max(abs(self.low), abs(self.high))
+            # At least two digits more than the two ends have in common.
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
         largest = max(abs(first_multiple), abs(last_multiple)) * spacing
@@ -394,6 +395,7 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     font = typeface_for(scale.name, letter_height)
     bar_length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letter_height))
     bar_width, gap = max(3, round(_BAR_WIDTH * height)), max(2, letter_height // 2)
+    # Ticks are two heights of letters apart, but at least two are asked for.
     ticks = scale.ticks(max(2, min(6, bar_length // (2 * letter_height))))
     tick_width = max(font.getlength(text) for _, text in ticks)
     width = max(bar_width + gap + tick_width, font.getlength(scale.name))

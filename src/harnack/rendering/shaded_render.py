@@ -63,7 +63,7 @@ class ConeCoverage:
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
         self.mi = mi
-        self.placed = tuple(_prepared(mi, carrier) for carrier in world.proxies)
+        self.placed = tuple(_prepared(mi, proxy) for proxy in world.proxies)
 
     def partly_covered(self, ray: Any, position: Any) -> Any:
         """Return the mask of pixels whose cones a surface covers in part, in front of the points
@@ -88,7 +88,7 @@ class ConeCoverage:
         return is_covered
 
 
-def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
+def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
     """Prepare the surface of a proxy (the mesh that stands for it in Mitsuba) for cones. Returns
     the surface with a tracer of its own, and a ball inside its extent and a ball around its extent,
     as `inner_and_outer_ball` returns them.
@@ -96,7 +96,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
     Raises:
         ValueError: the surface consists of level sets of several functions, or its field jumps.
     """
-    surface, backend = carrier.surface, mitsuba_backend(mi)
+    surface, backend = proxy.surface, mitsuba_backend(mi)
     if surface.field.patches is not None:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
@@ -108,7 +108,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
             'values tell no distance. Leave antialias at "edges"'
         )
     # Cones need a tracer that finds where f crosses the level.
-    placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
+    placed = replace(proxy.placed, prepared=surface.prepare(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 
 
@@ -348,6 +348,7 @@ class ShadedTask:
         """
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
+        # The first opaque hits, behind transparent solids (`RefractedHits`).
         hits = self.evaluate_with.trace(mi.Ray3f(ray))
         si, first = hits.si, hits.first
         # Adding zeros gives the mask its full width.
@@ -425,11 +426,11 @@ class ShadedTask:
         """Return the mask of interactions with a level set that bounds no solid, so that both of
         its sides can be seen."""
         is_open = self.mi.Bool(False)
-        for carrier in self.world.proxies:
-            surface = carrier.surface
+        for proxy in self.world.proxies:
+            surface = proxy.surface
             # The zero level set of a field of the class `Solid` bounds a solid, too.
             if surface.solid_range is None and not isinstance(surface.field, Solid):
-                is_open |= si.shape == self.mi.ShapePtr(carrier)
+                is_open |= si.shape == self.mi.ShapePtr(proxy)
         return is_open
 
     def shade(self, buffer: GBuffer, sky: Any) -> Any:
@@ -477,8 +478,9 @@ class ShadedTask:
 
     def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Gather the entries of arrays at n pixels and their four neighbors. Returns an array (n,
-        5, ...) for each given array. At the picture's border, a pixel takes the place of a missing
-        neighbor.
+        5, ...) for each given array: the entry of the pixel itself, then those of its neighbors to
+        the right, to the left, below and above. Beyond the picture's border there is no neighbor,
+        and the entry of the pixel itself stands in its place.
 
         indices: (n,) the pixels, counted by rows.
         arrays: Dr.Jit arrays with an entry for each pixel of the picture, counted by rows.
@@ -535,7 +537,7 @@ def render_shaded(
     ):
         dr.scatter(gbuffer, buffer, upload_indices(mi, order[start:stop]))
         dr.eval(gbuffer)
-        dr.sync_thread()
+        dr.sync_thread()  # kernels run asynchronously: only finished work is reported
         advance(_FIRST_PASS_FRACTION * (stop - start) / count)
     # All first hits are needed before the first pixel can be lit.
     sky = ambient_visibility(mi, gbuffer.position, gbuffer.normal, gbuffer.width, size)
