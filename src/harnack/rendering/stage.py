@@ -54,6 +54,7 @@ def _coated(color: Color, roughness: float) -> Dictionary:
         "type": "roughplastic",
         "diffuse_reflectance": _rgb(color),
         "alpha": roughness,
+        # Light that is reflected to and fro under the coat takes on more of the base's color.
         "nonlinear": True,
     }
 
@@ -105,7 +106,7 @@ class Material:
             ValueError: the material is transparent, and the surface is open.
         """
         front, back = self.front, self.back
-        if not traced_light:
+        if not traced_light:  # a missing back stays None
             front, back = _without_table(front), back and _without_table(back)
         if solid:
             return front

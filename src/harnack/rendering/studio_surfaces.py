@@ -280,6 +280,7 @@ def _surface(
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
     # In the call's cache, the field is prepared only once.
+    # All options of surfaces and of traces that `render` has.
     honored = names_of("render", "surface", "trace")
     target, choices = surface_and_options("render", element, options, shorthand, honored)
     surface = TracedSurface.of(target, choices).with_call_cache(begins=True)

@@ -220,6 +220,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 
     start = real(0), real(0), vector(0), vector(0)
     value, error, gradient, normal = update_where_active(active, sample_all, start, "at hits")
+    # (): no bounds in the neighborhood.
     return Sample(value, gradient, (), error, shading_normal=normal)
 
 
