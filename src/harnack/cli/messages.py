@@ -144,6 +144,7 @@ def _option(match: re.Match[str]) -> str:
     flag = f"--{name.replace('_', '-')}"
     if match["value"] is None or name in _SWITCHES:
         return flag
+    # Without quotes (chr(34)), brackets and spaces: "(0, 1)" becomes "0,1".
     return f"{flag} {match['value'].strip(chr(34)).strip('()[]').replace(' ', '')}"
 
 

@@ -275,6 +275,8 @@ class Session:
         surfaces = [
             surface_of_scene.surface for surface_of_scene in self.live.surfaces_at(controls)
         ]
+        # A `TracedSurface` consists of a `Surface` and of options of traces. All arrays of a result
+        # have one entry, as there is one ray.
         results = [
             trace(surface_of_scene.surface, origin, direction, options=surface_of_scene.options)
             for surface_of_scene in surfaces
