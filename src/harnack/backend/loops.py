@@ -84,6 +84,7 @@ def update_where_active(
         """Return the mask of lanes on which the loop runs its only iteration."""
         return active & (iteration < 1)
 
+    # Without the first entry, the number of iterations.
     return dr.while_loop((uint(0), *state), is_first, run_once, label=label)[1:]
 
 

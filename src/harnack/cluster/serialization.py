@@ -131,13 +131,13 @@ class SerializedObject:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: the object cannot be pickled.
         """
-        name, pickler = _hash_and_files(thing, label)
+        hash_text, pickler = _hash_and_files(thing, label)
         data = _pickle(_make_cacheless_pickler, thing, label).file.getvalue()
         files, other_versions = (
             sorted(pickler.files.items()),
             sorted(pickler.other_versions.items()),
         )
-        return cls(name, data, tuple(files), package_versions(), tuple(other_versions))
+        return cls(hash_text, data, tuple(files), package_versions(), tuple(other_versions))
 
     def deserialize(self) -> Any:
         """Unpickle the object. The four objects that were deserialized last in this process are
@@ -252,9 +252,10 @@ def _pickle(
                 "of arrays, numbers and the classes of this library"
             ) from error
         identifiers = frozenset(pickler.words)
-        # The pickler is complete if no module has further attributes whose names are words now.
-        if all(len(attributes_named(*module)) == len(attributes_named(module[0], identifiers))
-               for module in pickler.modules):  # fmt: skip
+        # The pickler is complete if no module has further attributes whose names are words now. A
+        # pair is a module and the words that were known when it was written.
+        if all(len(attributes_named(*pair)) == len(attributes_named(pair[0], identifiers))
+               for pair in pickler.modules):  # fmt: skip
             return pickler
 
 
@@ -374,6 +375,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             self.modules.append((module, words))
             attributes = attributes_named(module, words)
             left_out = frozenset(vars(module)) - frozenset(attributes)
+            # Pickle's form: a function, its arguments, the state, no items of lists and of
+            # dictionaries, and the function that sets the state.
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
@@ -386,6 +389,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return reduced
             refuse_imports_within(function)
             self.words |= words_of(function)
+            # Of cloudpickle's arguments, the code and the closure are kept, but not the globals.
             _, (code, _, _, _, closure), *rest = cast("tuple[Any, ...]", reduced)
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
@@ -516,6 +520,7 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             # An object that is described by its name only.
             if isinstance(reduced, str):
                 return tuple, ([str(getattr(obj, "__module__", None)).encode(), reduced.encode()],)
+            # A description without a state (the third entry) holds no names of attributes.
             if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
                 return cast("Any", reduced)
             constructor, arguments, state, *rest = cast("tuple[Any, ...]", reduced)

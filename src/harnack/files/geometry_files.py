@@ -148,6 +148,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     x, welded = contents.vertices, weld_vertices(contents.vertices)
     loops: list[LocatedLoop] = []
     open_edges: list[Edge] = []
+    # For the number of a vertex, the place of a polyline that contains it.
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
         # All vertices at the same position have the same number here.
@@ -431,18 +432,19 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
     net_faces, singular = welded.net, welded.edges
     if not len(net_faces.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
-    count = f"{len(faces):,} triangles"
+    count_text = f"{len(faces):,} triangles"
     if len(singular) == 0:
-        summary = f"{count} without singular edges: a closed mesh"
+        summary = f"{count_text} without singular edges: a closed mesh"
         center = vertices.mean(axis=0)
         # Six times the enclosed volume; negative if faces look inward.
         if np.linalg.det(vertices[faces] - center).sum() < 0.0:
             summary += ", whose faces look inward (the winding number inside is negative)"
     elif len(singular) >= len(faces):
-        summary = f"{count}, {len(singular):,} singular edges: a triangle soup"
+        summary = f"{count_text}, {len(singular):,} singular edges: a triangle soup"
     else:
         summary = (
-            f"{count}, {len(singular):,} singular edges: a mesh with holes or faces turned round"
+            f"{count_text}, {len(singular):,} singular edges: a mesh with holes or faces turned "
+            "round"
         )
     if welded.rounded:
         # Each vertex gets the position of the vertex that it was joined with.
@@ -461,6 +463,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
     """Return a cloud of points that stands for the triangles of a mesh: their centers, with their
     normals and areas."""
     corners = mesh.vertices[mesh.faces]
+    # The normal of each triangle, with its area as length.
     area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(area_normal, axis=1)
     summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
@@ -495,12 +498,12 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
     """Make a point cloud of the vertices of a file without faces, with their normals if it has
     them."""
     points = as_cloud_points(contents.vertices)
-    count = f"{len(points):,} points"
+    count_text = f"{len(points):,} points"
     if contents.normals is None:
-        summary = f"{count} without faces, and no normals read: a point cloud"
+        summary = f"{count_text} without faces, and no normals read: a point cloud"
         return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
-    return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
+    return LoadedCloud(points, normals, None, f"{count_text} with normals, no faces: a point cloud")
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:

@@ -75,6 +75,7 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
     except FileFormatError:
         raise
     except Exception as error:  # trimesh raises any error for malformed files
+        # The first line of the message or, if there is none, the error's type.
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
 
@@ -157,7 +158,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
     for accessor in accessors:
         element_bytes = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
         total += _count(accessor, "count") * element_bytes
-        _count(accessor, "byteOffset", 0)
+        _count(accessor, "byteOffset", 0)  # raises the error of a wrong offset
     # Of small files, 64 KiB count as their size.
     if total > 8 * max(size, 1 << 16):
         raise place.error(

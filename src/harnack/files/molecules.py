@@ -83,6 +83,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
     except (RuntimeError, ValueError, IndexError, UnicodeError) as error:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
+    # The number of atoms of each model, alternatives included.
     sizes = [model.count_atom_sites() for model in structure]
     # Only the first model counts.
     atoms = _drop_alternate_locations(structure[0]) if sizes else []

@@ -263,6 +263,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     # Beside faces, edges with other property names are not needed.
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
+        # Each edge is a polyline of two vertices.
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
     # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
@@ -275,8 +276,8 @@ def _check_elements(path: Path, header: PlyHeader) -> None:
     faces in a form that is not supported, such as strips of triangles."""
     names = [section.name for section in header.elements]
     for name in names:
-        is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
-        if name.lower() in _UNSUPPORTED_FACE_ELEMENTS or is_odd:
+        has_capitals = name.lower() in ("vertex", "face", "edge") and name != name.lower()
+        if name.lower() in _UNSUPPORTED_FACE_ELEMENTS or has_capitals:
             raise FileLocation(path).error(
                 f"its element {name[:40]!r} is not read: triangles are rows of the element 'face'"
             )
@@ -304,7 +305,7 @@ def _polygons(
     count: the number of vertices.
     """
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
-    # Indices are read as floats only if one of them is not whole.
+    # Indices are read as floats only if one of them is not whole. argmax finds the first such one.
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
         raise polygons.location_of_corner(k).error(
@@ -375,6 +376,7 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
             raise places[wrong[0]].error(f"{counts[wrong[0]]} numbers are too {how}")
         tables[section.name] = ElementTable(values, columns, places)
+    # The first line after all rows, if there is one.
     _check_end(path, b"".join(lines.text[:1]))
     return tables
 
@@ -412,6 +414,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             if (ends != begins + stride).any() or ends[-1] > values.size:
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
                 ends = np.fromiter(_row_ends(section, values, begin), np.int64, section.count)
+                # Each row begins where the one before ends.
                 columns, _ = _columns(section, values, np.append(begin, ends[:-1]), places)
         except struct.error:
             raise _too_short(path, section) from None
@@ -478,6 +481,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
     size = newline + 1 if newline >= 0 else len(data)
     byte_order: str | None = None
     sections: list[PlyElement] = []
+    # Line 1 is the word "ply".
     for number, line in enumerate(data[:end].splitlines()[1:], 2):
         place = FileLocation(path, f"line {number}")
         words = line.split()

@@ -92,8 +92,9 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocat
         raise lines.locations[wrong[0]].error(
             f"{counts[wrong[0]]} numbers: a loop is x y z repeated, so a multiple of 3"
         )
-    points = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
-    return [(loop, lines.locations[k]) for k, loop in enumerate(points)]
+    # All points, divided where a line ends.
+    loops = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
+    return [(loop, lines.locations[k]) for k, loop in enumerate(loops)]
 
 
 # Metaballs.
@@ -251,6 +252,7 @@ def _parse_obj_points(
     normal_words = [word[2] for word in words if len(word) == 3 and word[2]]
     if normals is None or not normal_words:
         return FileGeometry(path, vertices[points.corners])
+    # Errors name the first of these statements.
     normal_indices = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in normal_words]
     if len(normal_indices) != len(words) or not all(1 <= k <= len(normals) for k in normal_indices):
         raise (
@@ -399,6 +401,8 @@ def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines
     Raises:
         FileFormatError: it is malformed, or not supported.
     """
+    # Letters before OFF announce texture coordinates, colors and normals, which are ignored; "4"
+    # and "n" announce another number of coordinates.
     match = (
         re.match(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?!\S)\s*(.*)", lines.text[0]) if len(lines) else None
     )

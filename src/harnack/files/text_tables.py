@@ -111,7 +111,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
         FileFormatError: the word is not such an integer.
     """
     try:
-        value = int(b"" if b"_" in word else word)
+        value = int(b"" if b"_" in word else word)  # Python reads 1_0 as 10; int(b"") fails
     except ValueError:
         # Some programs write 3 as 3.000e+00.
         if not _is_integral(word):

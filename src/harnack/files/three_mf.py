@@ -70,6 +70,7 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
     except FileFormatError:
         raise
     except Exception as error:  # trimesh raises any error for malformed files
+        # The first line of the message or, if there is none, the error's type.
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
 
@@ -85,6 +86,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     unit = str(scene.units or "millimeter").lower().removesuffix("s")
     if unit not in _UNITS:
         raise place.error(f"its unit, {unit[:40]!r}, is none of {', '.join(_UNITS)}")
+    # The empty arrays are for a scene without nodes.
     vertices, faces, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]

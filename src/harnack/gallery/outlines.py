@@ -51,6 +51,7 @@ _WORD: tuple[tuple[int, ...], ...] = (
 
 def _nameplate() -> list[Surface]:
     """Return a plate with round ends and a hole, and a word in raised letters on it."""
+    # The round ends are half circles of radius 0.75 about x = 4.2 and x = -0.6.
     angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 90)
     right = np.column_stack([4.2 + 0.75 * np.cos(angle), 0.75 * np.sin(angle)])
     left = np.column_stack([-0.6 - 0.75 * np.cos(angle), -0.75 * np.sin(angle)])

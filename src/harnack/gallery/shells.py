@@ -29,6 +29,7 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 def _exoskeleton() -> list[Surface]:
     """Return a wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
+    # The two radii, and the numbers of segments the long way round and the short way.
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
     # The center line of the torus goes up and down three times, and its tube is thicker and

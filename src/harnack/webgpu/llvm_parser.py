@@ -587,7 +587,7 @@ class _LLVMParser:
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
         if stem in _UNARY_CALLS:
             self._emit(result, kind, _UNARY_CALLS[stem], self._value(operands[0], kind))
-        elif len(operands) == _CALLS.get(stem, -1):
+        elif len(operands) == _CALLS.get(stem, -1):  # -1: an unknown function
             self._emit(result, kind, stem, *(self._value(operand, kind) for operand in operands))
         else:
             raise UntranslatableError(

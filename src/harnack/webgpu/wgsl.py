@@ -210,6 +210,7 @@ class _WGSLWriter:
         place = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
             bits = f"lanes[{place}u * count + lane]"
+        # Two words and the starts of all tables precede the numbers.
         elif load.source == "number":
             bits = f"data[{2 + len(self._buffer_slots['table']) + place}]"
         else:
@@ -256,7 +257,7 @@ class _WGSLWriter:
             case "sdiv" | "srem":
                 operator = "/" if name == "sdiv" else "%"
                 return f"bitcast<u32>({_as_signed(a[0])} {operator} {_as_signed(a[1])})"
-            case "smin" | "smax":
+            case "smin" | "smax":  # WGSL's min and max
                 return f"bitcast<u32>({name[1:]}({_as_signed(a[0])}, {_as_signed(a[1])}))"
             case "iabs":
                 return f"bitcast<u32>(abs({_as_signed(a[0])}))"
