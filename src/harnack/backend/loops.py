@@ -286,6 +286,7 @@ def _run_queue(
         ray_ids = dr.gather(index_type, ray_indices, lane.queue_index, is_ended)
         for target, value in zip(results, array_leaves(result(new_state)), strict=True):
             dr.scatter(target, value, ray_ids, is_ended)
+        # 0 is the index of the counter, an array of one entry.
         queue_index = dr.select(
             is_ended, dr.scatter_inc(next_position, index_type(0), is_ended), lane.queue_index
         )

@@ -88,6 +88,7 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
     """
     text = data
     if place.path.suffix.lower() == ".glb":
+        # Twenty bytes precede the JSON header.
         if len(data) < 20 or data[:4] != b"glTF":
             raise place.error("this is no .glb file: it does not begin with 'glTF'")
         # A .glb file begins with "glTF", the version and the file's length; then come the length of
@@ -275,6 +276,7 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
         vertex_count += len(positions)
     if sum(map(len, faces)):
         triangles = triangles_as_polygons(place.path, np.concatenate(faces))
+        # None: no normals.
         return FileGeometry(place.path, np.concatenate(vertices), None, triangles)
     if points:
         return FileGeometry(place.path, np.concatenate(points))

@@ -177,7 +177,8 @@ def _check_coordinates(path: Path, text: str) -> None:
                     "ATOM and HETATM begin in column 1"
                 )
             continue
-        # The decimal points of the three numbers must be in the same column of each.
+        # The decimal points of the three numbers must be in the same column of each. Counted from
+        # 0, the numbers begin in columns 30, 38 and 46.
         dot_columns = {line[k : k + 8].find(".") for k in (30, 38, 46)}
         if len(dot_columns) > 1 and not any(c.isspace() for c in line[30:54]):
             raise FileLocation(path, f"line {number}").error(

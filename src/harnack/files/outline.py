@@ -229,6 +229,7 @@ def svg(
         raise FileFormatError(f"{source}: an SVG file has at most {_MAX_SVG_BYTES >> 20} MB")
     try:
         root = _parse_svg(source.read_bytes())
+        # The root has no transform before it, and inherits no styles.
         shapes = [*_filled_shapes(root, np.eye(3), {})]
         return _outline_of(shapes, scale, tolerance)
     except (ValueError, ArithmeticError, LookupError, ParseError, expat.ExpatError) as wrong:

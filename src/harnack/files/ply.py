@@ -331,7 +331,7 @@ def _columns(
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
     for prop in section.properties:
-        if prop.length_code is None:
+        if prop.length_code is None:  # a single number, with no lengths of lists
             columns[prop.name] = PropertyColumn(prop.code, positions, offset, None)
             offset += values.width(prop.code)
             continue
@@ -524,6 +524,7 @@ def _parse_property(words: list[bytes], section: PlyElement, place: FileLocation
             integer.
     """
     types = words[2:4] if words[1:2] == [b"list"] else words[1:2]
+    # A list has two types: of its length, and of its numbers.
     if len(words) != (5 if len(types) == 2 else 3) or any(t not in _CODES for t in types):
         raise place.error("a property is 'property TYPE NAME' or 'property list TYPE TYPE NAME'")
     name = words[-1].decode("ascii", "backslashreplace")

@@ -65,6 +65,7 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
         return FileGeometry(path, table[:, :3])
     normals = table[:, 3:6]
     length = np.linalg.norm(normals, axis=1)
+    # Normals with few digits are not exactly of unit length.
     wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
     if wrong.size:
         raise lines.locations[wrong[0]].error(
@@ -223,6 +224,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
     # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
+    # Normals are needed for point clouds only.
     if len(faces) or len(polylines):
         return FileGeometry(path, vertices, None, faces, polylines)
     normals = read_table(rows[b"vn"], 3) if len(rows[b"vn"]) else None
@@ -386,6 +388,7 @@ def _integers(
     Raises:
         FileFormatError: a number is no integer.
     """
+    # Below 2^53, floats hold integers exactly.
     wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
     if wrong.size:
         # Parsing the first wrong word alone raises the error that names it.
@@ -448,6 +451,7 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
     corners = _parse_binary_stl(path, data) if _is_binary(data) else _parse_text_stl(path, data)
     if not len(corners):
         raise FileLocation(path).error("it holds no triangles")
+    # One row for each triangle, so that errors name the triangle.
     check_finite(corners.reshape(-1, 9), FileLocations(path, "triangle", range(len(corners) // 3)))
     distinct, index = np.unique(weld_vertices(corners), return_inverse=True)
     return FileGeometry(

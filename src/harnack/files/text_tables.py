@@ -117,6 +117,7 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
         if not _is_integral(word):
             raise place.error(f"{excerpt(word)} is not an integer") from None
         value = int(float(word))
+    # It must fit into 64 bits, also after numbers of vertices were added.
     if abs(value) >= 2**62:
         raise place.error(f"vertex {value} is out of range: no file has as many")
     return value

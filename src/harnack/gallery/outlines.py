@@ -56,6 +56,7 @@ def _nameplate() -> list[Surface]:
     right = np.column_stack([4.2 + 0.75 * np.cos(angle), 0.75 * np.sin(angle)])
     left = np.column_stack([-0.6 - 0.75 * np.cos(angle), -0.75 * np.sin(angle)])
     (hole,) = outline.regular_polygon(120, 0.25)
+    # The second argument of an extrusion is its height.
     plate = Extrusion([np.concatenate([right, left]), hole - (0.65, 0.0)], 0.2)
     letters = [np.reshape(loop, (-1, 2)) / 1000.0 - (0.0, 0.37) for loop in _WORD]
     # A little way into the plate, so that no faces coincide.

@@ -50,6 +50,7 @@ def _metaballs() -> list[Surface]:
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
     radii = np.concatenate([[0.72], 0.26 + 0.06 * np.cos(2 * angle), [0.42]])
     weights = np.array([1.0] * 10 + [-1.2])
+    # A blob ends at 1.8 of its radius; the solid is where the sum is at least 1.
     return _solid(Blobs(centers, radii, weights, kernel=CompactKernel(1.8)), 1.0)
 
 
@@ -60,6 +61,7 @@ def _groups() -> list[Surface]:
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
     upright = np.column_stack([np.cos(angle) + 0.5, 0 * angle, np.sin(angle)])
     centers = np.concatenate([flat, upright])
+    # All blobs have the radius 0.3; the solid is where the sum of a group is at least 1.
     return _solid(Blobs(centers, 0.3, groups=[0] * 12 + [1] * 12), 1.0)
 
 

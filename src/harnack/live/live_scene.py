@@ -696,6 +696,7 @@ def surface_colors(body: StudioObject) -> list[JsonDict]:
     section_material = body.material if body.section_material is None else body.section_material
     front, back, glossy = _reflectances(section_material.bsdf(solid=is_solid, traced_light=False))
     paints.append(_paint(front, back, glossy))
+    # Lines are the same on both sides, and not glossy.
     lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in body.isolines]
     return [*paints, *(_paint(line, line, False) for line in lines)]
 

@@ -123,7 +123,7 @@ class PreviewRenderer:
         ):
             self._hit_cache = cache_key, self._trace(mi, painted, eye, size, has_floor=has_floor)
             dr.eval(self._hit_cache[1])
-        hits = self._hit_cache[1]
+        hits = self._hit_cache[1]  # the cache is a pair (key, hits)
         if show != "shaded":
             return _aov_preview(hits, show, AOV_BACKGROUNDS[ground], size)
         # The shadow is computed first: it evaluates arrays, and whatever was recorded before
@@ -293,6 +293,7 @@ def _aov_preview(
     elif show == "depth" and met.any():
         t = to_numpy(hits["t"])[met]
         depths = float(t.min()), float(t.max())
+        # The maximum is for hits that all have the same depth.
         share = (t - depths[0]) / max(depths[1] - depths[0], 1e-12)
         picture[met] = (NEAR_GRAY + share * (FAR_GRAY - NEAR_GRAY))[:, None]
     elif show == "evaluations":

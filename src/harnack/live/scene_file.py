@@ -745,7 +745,7 @@ def _from_json_value(value: Any, where: str) -> Any:
         return value
     data = cast("Plain", value)
     if "curves" in data or "formula" in data:
-        return _field_of(data, where, None)
+        return _field_of(data, where, None)  # None: it names no files
     # Any other object is a class name with arguments.
     kinds = _constructible_types()
     if len(data) != 1:

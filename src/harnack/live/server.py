@@ -60,6 +60,7 @@ class LiveView:
     def wait(self) -> None:
         """Wait until Ctrl-C is pressed, or until the view is closed elsewhere."""
         try:
+            # Short waits, between which Ctrl-C is noticed.
             while not self._ended.wait(0.2):
                 pass
         except KeyboardInterrupt:

@@ -117,6 +117,7 @@ def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
     levels = surface.level_values
     levels_text = ", ".join(f"{level:g}" for level in levels)
     reason = f"the surface of level {levels_text} reaches to infinity, as far as is known"
+    # The remainder is the distance from the nearest multiple of the period.
     if field.period is not None and any(
         abs(math.remainder(level, field.period)) < 1e-6 * field.period for level in levels
     ):

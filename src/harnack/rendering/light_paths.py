@@ -129,6 +129,7 @@ def render_paths(
     executor = Executor(task) if executor is None else executor
     width, height = task.size
     features = task.features
+    # The columns are those of `render_range`: radiance, covered fraction, albedo and normal.
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
     ranges = executor.split_range(width * height, max(1, task.paths_a_band // task.spp))
@@ -402,6 +403,7 @@ class RefractionTracer:
         self, world: HybridScene, light: StudioLight, *, hides_lights: bool = False
     ) -> None:
         self.world, self.light = world, light
+        # The mask of rays that do not see lights: all of them, or none.
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
         pairs = ((proxy, refractive_index(mi, proxy)) for proxy in world.proxies)

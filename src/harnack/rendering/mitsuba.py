@@ -324,7 +324,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     is_refracted = refracted_cosine > 0
     refracted_cosine = dr.sqrt(dr.maximum(refracted_cosine, 0))
     # Fresnel's amplitudes for light that is polarized perpendicular and parallel to the plane of
-    # incidence.
+    # incidence. The divisors are kept above 0.
     perpendicular = (eta * cosine - refracted_cosine) / dr.maximum(
         eta * cosine + refracted_cosine, 1e-9
     )

@@ -103,6 +103,7 @@ def _from_text(text: str, name: str) -> Color:
             raise ValueError(
                 f"{name} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
+        # "#rgb" stands for "#rrggbb".
         digits = match[1] if len(match[1]) == 6 else "".join(2 * digit for digit in match[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
@@ -307,6 +308,7 @@ def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, st
     """Choose ticks for a cyclic scale from 0 to `multiple` times pi. Returns pairs (number, text)
     at multiples of pi/2, pi, 2 pi, ...: at the closest spacing with at most `max_count` ticks, but
     at least two."""
+    # In units of pi/2; the last one is that of the largest multiple, `_MAX_PI_MULTIPLE`.
     spacing_in_halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple

@@ -233,7 +233,7 @@ def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     color, other: the colors of the visible and of the hidden side.
     inside: mask of points that are seen from the side of larger values.
     """
-    is_one_color = dr.max(dr.abs(color - other)) < 1e-4
+    is_one_color = dr.max(dr.abs(color - other)) < 1e-4  # equal up to rounding
     return dr.select(inside & is_one_color, color * _like(color, _INNER_TINT), color)
 
 
@@ -243,6 +243,7 @@ def hole_filling_tint(color: Any, is_filling: Any) -> Any:
 
     is_filling: mask of such points.
     """
+    # In a warm color, red is much stronger than blue.
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(is_filling, dr.lerp(color, tint, _FILLING_TINT), color)
 

@@ -348,6 +348,7 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     turned = np.eye(3) if turned is None else turned
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
+    # The points may all be the same.
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
     # The middle of the box's base is placed at the origin of the world.
     base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])

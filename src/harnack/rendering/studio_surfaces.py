@@ -49,6 +49,7 @@ def drawn_surfaces(
     thickness: if not None, closed walls of this thickness are drawn in place of the surfaces.
     shorthand: options of `Surface` and `TraceOptions` as keywords.
     """
+    # Only the surfaces are used here, so the material (None, the default) does not matter.
     drawn = studio_objects(
         surfaces, None, options, shorthand, boundary_radius=boundary_radius, thickness=thickness
     )

@@ -170,6 +170,7 @@ class CompiledShader:
         entries = [
             {"binding": k, "resource": {"buffer": buffer}} for k, buffer in enumerate(buffers)
         ]
+        # The shader's three buffers are bindings 0 to 2 of its only group, 0.
         layout = self.pipeline.get_bind_group_layout(0)
         encoder = handle.create_command_encoder()
         compute_pass = encoder.begin_compute_pass()

@@ -311,7 +311,9 @@ class _LLVMParser:
                 if text.startswith("0x")
                 else float(text)
             )
+            # The bits of the number in single precision.
             return Constant(kind, struct.unpack("<I", struct.pack("<f", double))[0])
+        # Negative integers as their 32 bits.
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
     def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:

@@ -292,6 +292,7 @@ class _WGSLWriter:
             return "true" if value.bits else "false"
         if value.kind == "u32":
             return f"{value.bits}u"
+        # The float that has these bits, and its biased exponent.
         number: float = struct.unpack("<f", struct.pack("<I", value.bits))[0]
         exponent = (value.bits >> 23) & 255
         # Infinity or NaN. A compiler must not know the bits, so a zero from a buffer is mixed in.
