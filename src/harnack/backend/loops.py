@@ -265,6 +265,7 @@ def _run_queue(
     def fetch_rays(queue_index: Any, mask: Mask) -> Any:
         """Return the initial states of the rays at the positions `queue_index` of the queue, for
         the lanes of `mask`."""
+        # The queue, `ray_indices`, holds indices of rays, and `start` the initial states of all.
         ray_ids = dr.gather(index_type, ray_indices, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
@@ -290,6 +291,7 @@ def _run_queue(
         queue_index = dr.select(
             is_ended, dr.scatter_inc(next_position, index_type(0), is_ended), lane.queue_index
         )
+        # At the end of the queue, a lane takes no further ray, and stays inactive.
         is_fetching = is_ended & (queue_index < opaque_ray_count)
         fetched_and_new = zip(
             array_leaves(fetch_rays(queue_index, is_fetching)), array_leaves(new_state), strict=True

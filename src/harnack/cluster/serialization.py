@@ -513,8 +513,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             self.note_origin(obj)
             reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
-            # What pickle would do as usual is asked for here; a definition is described by its
-            # name.
+            # What pickle would do as usual is asked for here, unless cloudpickle has a function for
+            # the type (in `dispatch_table`); a definition is described by its name.
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
                 reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
             # An object that is described by its name only.

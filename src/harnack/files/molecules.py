@@ -99,6 +99,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         raise place.error(
             f"atom {known_atoms[invalid[0]].serial} has coordinates that are not finite"
         )
+    # gemmi's radii are rounded to single precision: 1.7 is 1.70000005 there.
     radii = np.array([round(atom.element.vdw_r, 6) for atom in known_atoms], dtype=np.float64)
     elements = tuple(atom.element.name for atom in known_atoms)
     left_out = {

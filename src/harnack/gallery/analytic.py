@@ -117,8 +117,9 @@ def _fitted_knot() -> list[Surface]:
     """Return a solid around a trefoil knot. Its field is a sum of Gaussians along the knot,
     approximated by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
-    step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
-    # The Gaussians' width, and the lengths of the curve's edges as weights of the sum.
+    # The lengths of the curve's edges are the weights of the sum.
+    edge_lengths = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    # The Gaussians' width.
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
@@ -127,7 +128,7 @@ def _fitted_knot() -> list[Surface]:
         so that it is about 1 on the curve."""
         # In batches, as the array of all distances would take much memory.
         sums = [
-            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ edge_lengths
             for batch in np.array_split(x, len(x) // 4000 + 1)
         ]
         return np.concatenate(sums) / (width * math.sqrt(math.pi))

@@ -282,14 +282,14 @@ def estimate_time(
     not measured, and its estimate is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    pixels = width * height
-    path_count = pixels * spp
+    pixel_count = width * height
+    path_count = pixel_count * spp
 
     def seconds(count: int) -> float:
         """Return the time of a run of `count` paths."""
         # The golden ratio spreads any number of pixels evenly.
-        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
-        pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
+        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixel_count).astype(np.int64)
+        pixel = upload_indices(mi, np.minimum(indices, pixel_count - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
         # One path in each of these pixels, with 0 as the seed.

@@ -174,7 +174,7 @@ def ambient_visibility(
         distance; 0 if nothing is seen there."""
         # Points are denser near the pixel: their distances grow quadratically.
         distance = 1.0 + reach_in_pixels * ((k + 0.5) / SKY_SAMPLES) ** 2
-        # The pixel nearest to this point of the picture.
+        # The pixel nearest to this point of the picture. (x, y) is the pixel of the lane.
         u, v = x + distance * direction.x, y + distance * direction.y
         is_in_picture = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         pixel = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
@@ -330,7 +330,7 @@ class ShadedTask:
         pixel = upload_indices(mi, self.order[start:stop])
         gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
         dr.eval(gbuffer)
-        if self.finder is not None:
+        if self.finder is not None:  # a `ConeCoverage`, if cones are requested
             ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
             gbuffer.needs_refinement |= self.finder.partly_covered(ray, gbuffer.position)
             dr.eval(gbuffer)
@@ -460,6 +460,7 @@ class ShadedTask:
         position, sky: (n, 5, 3) and (n, 5), the points seen by each pixel and its four neighbors,
             and the fractions of the hemisphere there that nothing hides (`neighborhood`).
         """
+        # `offsets` are the samples of a pixel besides its middle.
         mi, spp = self.mi, len(self.offsets)
         # Successive lanes are the samples of one pixel, then those of the next.
         sample = dr.arange(mi.UInt32, len(indices) * spp)
