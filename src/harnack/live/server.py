@@ -230,7 +230,7 @@ class _PageServer:
         def serve() -> None:
             """Run the event loop until the view is closed, and then end everything that waits for
             it."""
-            # `runner` answers requests, and `ended` tells the `LiveView` that nothing runs any more.
+            # `runner` answers requests; `ended` tells the `LiveView` that nothing runs any more.
             asyncio.set_event_loop(loop)
             try:
                 loop.run_forever()
