@@ -132,6 +132,7 @@ class SerializedObject:
             TypeError: the object cannot be pickled.
         """
         hash_text, pickler = _hash_and_files(thing, label)
+        # What is sent is another pickle than the one that is hashed.
         data = _pickle(_make_cacheless_pickler, thing, label).file.getvalue()
         files, other_versions = (
             sorted(pickler.files.items()),
@@ -475,7 +476,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             changes from run to run. The name of a file is replaced by a hash of the file.
             """
             obj_type = cast("type[Any]", type(obj))
-            if id(obj) in self.begun:  # classes, functions and modules may name themselves
+            # Classes, functions and modules may name themselves. An entry is (object, number).
+            if id(obj) in self.begun:
                 return f"number {self.begun[id(obj)][1]}"
             if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)

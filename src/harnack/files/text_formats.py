@@ -219,6 +219,7 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
         for k, (text, numbers) in statements.items()
     }
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
+    # The least numbers of corners are 3 and 2.
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
     # Faces of different sizes are handled one by one, which takes long.

@@ -255,9 +255,9 @@ def _cameras(
     boxes = [np.array(camera.box.bounds()) for camera in cameras if camera.box is not None]
     # Tracing rays for visible points is needed only without boxes.
     points = np.concatenate(boxes or [_points(moments, steps)])
-    # The box of all that has to be in view; if boxes were given, its corners.
+    # The lower and the upper corner of the box of all that has to be in view.
     corners = np.array([points.min(axis=0), points.max(axis=0)])
-    if boxes:
+    if boxes:  # then all eight corners of this box are framed
         points = np.array(np.meshgrid(*corners.T)).reshape(3, -1).T
     box, center = Box(*map(_as_point, corners)), _as_point(corners.mean(axis=0))
     framed = [

@@ -216,6 +216,7 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
     if mi.is_spectral:
         color_matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
         xyz = sum(value * weights for value, weights in zip(radiance, color_matching, strict=True))
+        # The mean over the wavelengths, scaled such that white has Y = 1.
         return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(color_matching)))
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 

@@ -377,7 +377,7 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "fov": pose.fov,
         "fov_axis": "larger",
         # Rays begin one to two steps before the stage, at a whole multiple of a step, since the
-        # distance is a literal of kernels.
+        # distance is a literal of kernels. It must be positive.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,

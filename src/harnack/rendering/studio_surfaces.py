@@ -280,10 +280,10 @@ def _surface(
     # Such a surface has all of its options already.
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
-    # In the call's cache, the field is prepared only once.
     # All options of surfaces and of traces that `render` has.
     honored = names_of("render", "surface", "trace")
     target, choices = surface_and_options("render", element, options, shorthand, honored)
+    # In the call's cache, the field is prepared only once.
     surface = TracedSurface.of(target, choices).with_call_cache(begins=True)
     return with_visible_inside(surface, is_clear=is_clear)
 

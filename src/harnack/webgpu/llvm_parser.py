@@ -264,6 +264,8 @@ class _LLVMParser:
             instruction = _FLAGS.sub("", instruction.partition(", align ")[0])
             for pattern, action in self._patterns.get(instruction.partition(" ")[0], ()):
                 if (match := pattern.fullmatch(instruction)) is not None:
+                    # With the name of the result, which a branch and a store lack, and the parts
+                    # that the pattern has found.
                     action(*((result,) if result else ()), *match.groups())
                     return
             raise UntranslatableError(

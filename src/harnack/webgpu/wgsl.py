@@ -133,6 +133,8 @@ class _WGSLWriter:
             for source, parameters in self._buffer_slots.items()
         }
         results = tuple(self._label(statement.parameter) for statement in self._stores)
+        # Workgroups form a rectangle, since each axis is limited. The words `count` and `zero` are
+        # the number of lanes, and a 0 that the compiler does not know.
         code = "\n".join(
             [
                 _PRELUDE,
