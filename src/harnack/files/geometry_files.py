@@ -318,6 +318,7 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
         FileFormatError: the file cannot be read, or not in this way.
     """
     if kind == ".blobs":
+        # (): these files can be read in one way only, and `read_as` must be None.
         _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
     if kind in MOLECULE_FILES:

@@ -395,6 +395,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
     tables: dict[str, ElementTable] = {}
     begin = header.size
     for section in header.elements:
+        # The length of a row whose lists are all empty.
         min_stride = sum(values.width(p.length_code or p.code) for p in section.properties)
         if section.count * min_stride > values.size - begin:
             raise _too_short(path, section)
@@ -405,8 +406,8 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             # In most files the lists of all rows are as long as those of the first row, and not
             # empty.
             stride = next(_row_ends(section, values, begin)) - begin
-            # Then all lists of the first row are empty. Rows without data could be declared in any
-            # number, so their number is checked.
+            # A file could declare any number of rows with empty lists only, which take few bytes.
+            # If the first row is one, the number of rows is checked.
             if stride == min_stride and any(p.length_code for p in section.properties):
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)

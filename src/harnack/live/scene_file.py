@@ -141,6 +141,7 @@ class SceneFile:
         """The surfaces, each with those options of the scene that are keywords of `Surface`
         (level, clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
+        # Of the two results, the surface and the options of traces, the surface.
         return tuple(
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
             for surface in self.surfaces
@@ -438,7 +439,7 @@ def _to_json_value(value: Any) -> Any:
         return int(cast("Any", value))
     if isinstance(value, Sequence):
         return [_to_json_value(entry) for entry in cast("Sequence[Any]", value)]
-    if isinstance(value, Field):
+    if isinstance(value, Field):  # a field in another object, without an entry of its own
         return _field_to_json(value, ())
     if type(value).__name__ in _constructible_types():
         return _object_to_json(value)

@@ -112,6 +112,7 @@ class _WGSLWriter:
 
     def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
+        # The parameters of each kind, each of them once.
         slots: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
         self._stores: list[Store] = []
         for statement in kernel.walk():
