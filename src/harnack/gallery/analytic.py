@@ -68,6 +68,7 @@ def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface
     box: whether it is cut to a box; otherwise to a ball.
     """
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
+    # The first argument is the period along each axis.
     return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
 
 

@@ -293,7 +293,7 @@ def _aov_preview(
     elif show == "depth" and met.any():
         t = to_numpy(hits["t"])[met]
         depths = float(t.min()), float(t.max())
-        # The maximum is for hits that all have the same depth.
+        # The divisor has a lower limit, for hits that all have the same depth.
         share = (t - depths[0]) / max(depths[1] - depths[0], 1e-12)
         picture[met] = (NEAR_GRAY + share * (FAR_GRAY - NEAR_GRAY))[:, None]
     elif show == "evaluations":

@@ -316,7 +316,7 @@ class _PageServer:
                 except RequestError as wrong:
                     await _send(socket, {"id": None, "error": str(wrong)})
                     continue
-                if question is None:
+                if question is None:  # another question was cancelled
                     continue
                 # Too many questions at once are refused, so that a page cannot fill the memory.
                 if len(waiting) >= _WAITING:

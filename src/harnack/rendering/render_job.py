@@ -130,6 +130,7 @@ class RenderJob:
         spp = options.spp or check_spp(
             int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
         )
+        # The denoiser needs the features, albedo and normal, at first hits.
         return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
     def _task_in_variant(self) -> Any:
