@@ -18,5 +18,6 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
     if not isinstance(misspelled, str):
         return ""
     name_of_lowercase = {name.lower(): name for name in candidates}
+    # Comparing long texts takes long: the beginning suffices.
     similar = difflib.get_close_matches(misspelled[:100].lower(), name_of_lowercase, n=1)
     return f'; did you mean "{name_of_lowercase[similar[0]]}"?' if similar else ""

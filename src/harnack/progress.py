@@ -125,6 +125,7 @@ class _TextLines:
         self._last = now
         text = f"{self._name}: {progress}"
         if done is not None:
+            # By what was finished after the first half second; if that is nothing, by all.
             left = past * (1 - done) / (done - self._cached_fraction or done)
             text = f"{progress} after {past:.0f} s, about {left:.0f} s left"
         print(text, file=sys.stderr, flush=True)

@@ -115,6 +115,7 @@ def _check_ieee_arithmetic(backend: Backend) -> None:
     Raises:
         RuntimeError: a result differs from NumPy's.
     """
+    # Special and ordinary numbers; the last one is 2^24, to which adding 1 is rounded.
     values = np.array([1, 3, 0, -0.0, 1e-30, 8e37, np.inf, np.nan, 0.1, 16777216], np.float32)
     x, one = upload_floats(backend, values), dr.opaque(backend.Float, 1)
     np_one = np.float32(1)

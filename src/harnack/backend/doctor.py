@@ -141,7 +141,7 @@ def try_kernel(precision: str) -> None:
         RuntimeError: the result is wrong.
     """
     backend = choose_backend("double" if precision == "double" else "single")
-    table = dr.arange(backend.Float, 8) + 1
+    table = dr.arange(backend.Float, 8) + 1  # 1 to 8
     dr.eval(table)
     x = dr.linspace(backend.Float, 0, 1, 64)
 

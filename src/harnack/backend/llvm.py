@@ -96,6 +96,7 @@ def _version_from_soname(path: Path) -> int | None:
     """Return the major version in the SONAME of a library (the name that the library stores for the
     linker); None if there is none."""
     try:
+        # 0: the whole file is mapped.
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             match = re.search(rb"\0libLLVM(?:-(\d+)[.\d]*\.so|\.so\.(\d+))[.\d]*\0", data)
             return int(match[1] or match[2]) if match else None
@@ -218,6 +219,7 @@ def _mapped_libraries() -> tuple[Path, ...]:
     if not maps.exists():
         return ()
     lines = maps.read_text(errors="replace").splitlines()
+    # The sixth column of a line is the path of the file.
     names = {line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line}
     return tuple(Path(name) for name in sorted(names))
 

@@ -84,6 +84,7 @@ def update_where_active(
         """Return the mask of lanes on which the loop runs its only iteration."""
         return active & (iteration < 1)
 
+    # Without the first entry, the number of iterations.
     return dr.while_loop((uint(0), *state), is_first, run_once, label=label)[1:]
 
 
@@ -264,6 +265,7 @@ def _run_queue(
     def fetch_rays(queue_index: Any, mask: Mask) -> Any:
         """Return the initial states of the rays at the positions `queue_index` of the queue, for
         the lanes of `mask`."""
+        # The queue, `ray_indices`, holds indices of rays, and `start` the initial states of all.
         ray_ids = dr.gather(index_type, ray_indices, queue_index, mask)
 
         def gather(leaf: Any) -> Any:
@@ -285,9 +287,11 @@ def _run_queue(
         ray_ids = dr.gather(index_type, ray_indices, lane.queue_index, is_ended)
         for target, value in zip(results, array_leaves(result(new_state)), strict=True):
             dr.scatter(target, value, ray_ids, is_ended)
+        # 0 is the index of the counter, an array of one entry.
         queue_index = dr.select(
             is_ended, dr.scatter_inc(next_position, index_type(0), is_ended), lane.queue_index
         )
+        # At the end of the queue, a lane takes no further ray, and stays inactive.
         is_fetching = is_ended & (queue_index < opaque_ray_count)
         fetched_and_new = zip(
             array_leaves(fetch_rays(queue_index, is_fetching)), array_leaves(new_state), strict=True

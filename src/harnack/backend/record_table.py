@@ -110,6 +110,7 @@ class RecordTable:
         i = i if self.first_record is None else i + self.first_record
         for k in range(self.packets_per_record):
             index = i * self.packets_per_record + k
+            # Eight numbers at once, for each lane: those from 8 * index on.
             packet = dr.gather(self.backend.ArrayXf, self.buffer, index, active, shape=(PACKET, 1))
             numbers += [packet[j] for j in range(PACKET)]
         return numbers
@@ -144,5 +145,6 @@ class RecordTable:
             """Return the mask of lanes on which iteration i runs."""
             return i < iterations
 
+        # The index of the iteration comes before the state, and is dropped at the end.
         start = (self.backend.UInt32(0), *state)
         return dr.while_loop(start, is_active, read_and_apply, label=label)[1:]

@@ -155,19 +155,21 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         PyTorch's object that keeps values from the forward pass for the backward pass."""
 
         @staticmethod
-        def forward(ctx: Any, arguments: list[Any], container: list[Any], *tensors: Any) -> Any:
+        def forward(ctx: Any, arguments: list[Any], own_result: list[Any], *tensors: Any) -> Any:
             """Return the results as PyTorch tensors.
 
-            arguments: the arguments of `function`, with None in place of tensors. container: a list
-            to which the result of `function` itself is appended. The caller needs its type (tuple,
-            list, ...). tensors: PyTorch's tensors among the arguments.
+            arguments: the arguments of `function`, with None in place of tensors.
+            own_result: an empty list, to which the result of `function` itself is appended. The
+                caller needs its type (tuple, list, ...).
+            tensors: PyTorch's tensors among the arguments.
             """
             inputs, outputs = run_function(arguments, tensors)
-            container.append(outputs)
+            own_result.append(outputs)
             # PyTorch keeps the tensors for a second backward pass, and Dr.Jit's graph serves the
             # first.
             ctx.save_for_backward(*tensors)
             ctx.arguments, ctx.graph = arguments, (inputs, _results(outputs))
+            # `graph` holds the tensors of the arguments, and the list of results.
             results = tuple(dr.detach(_as_tensor(value)).torch() for value in ctx.graph[1])
             # PyTorch asks for no gradients of integers.
             integral = (result for result in results if not result.is_floating_point())
@@ -201,8 +203,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         tensors = [value for value in args if isinstance(value, torch.Tensor)]
         # Tensors are passed one by one, as PyTorch differentiates by direct arguments only.
         arguments = [None if isinstance(value, torch.Tensor) else value for value in args]
-        container: list[Any] = []
-        return _in_container(container, iter(Wrapped.apply(arguments, container, *tensors)))
+        own_result: list[Any] = []
+        return _in_container(own_result, iter(Wrapped.apply(arguments, own_result, *tensors)))
 
     return wrapped
 
@@ -215,14 +217,16 @@ def _results(outputs: Any) -> list[Any]:
     return list(cast("list[Any]", outputs)) if isinstance(outputs, (tuple, list)) else [outputs]
 
 
-def _in_container(container: list[Any], results: Any) -> Any:
-    """Put results into a container of the same type (and with the same keys) as the function's own
-    result.
+def _in_container(own_result: list[Any], results: Any) -> Any:
+    """Return arrays of another framework in a container of the same type (and with the same keys)
+    as the result of the wrapped function: a dictionary, a tuple or a list. If that result is a
+    single array, the single array of the other framework is returned.
 
-    container: a list whose only entry is the function's own result.
-    results: an iterator.
+    own_result: a list whose only entry is the result of the wrapped function, Dr.Jit's arrays. It
+        is a list, as it is filled while the function is called. The entry is removed.
+    results: an iterator over the arrays of the other framework, in the order of the container.
     """
-    outputs = container.pop()
+    outputs = own_result.pop()
     if isinstance(outputs, dict):
         return dict(zip(cast("dict[Any, Any]", outputs), results, strict=True))
     return type(outputs)(results) if type(outputs) in (tuple, list) else next(results)

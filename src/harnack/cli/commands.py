@@ -245,7 +245,7 @@ def _gallery(arguments: Any) -> int:
                 f"{did_you_mean(name, SCENES)}"
             )
     scenes = [SCENES[name] for name in arguments.names] or list(SCENES.values())
-    if arguments.demo:
+    if arguments.demo:  # only scenes of the demo have a number of samples for it
         scenes = [scene for scene in scenes if scene.demo_spp > 0]
     folder = _create_folder(arguments.output)
     for index, scene in enumerate(scenes, start=1):

@@ -144,6 +144,7 @@ def _option(match: re.Match[str]) -> str:
     flag = f"--{name.replace('_', '-')}"
     if match["value"] is None or name in _SWITCHES:
         return flag
+    # Without quotes (chr(34)), brackets and spaces: "(0, 1)" becomes "0,1".
     return f"{flag} {match['value'].strip(chr(34)).strip('()[]').replace(' ', '')}"
 
 
@@ -151,7 +152,7 @@ def level_text(level: float | None) -> str:
     """Return the text of a level on the command line, such as "2pi" or "0.5": a multiple of pi for
     a nonzero multiple of pi/2, otherwise a plain number. level: the number; None raises a
     TypeError."""
-    ratio = (level or 0.0) / 3.141592653589793
+    ratio = (level or 0.0) / 3.141592653589793  # as a multiple of pi
     if ratio and abs(2 * ratio - round(2 * ratio)) < 1e-9:
         return f"{ratio:g}pi" if ratio != 1 else "pi"
     return f"{level:g}"

@@ -289,6 +289,7 @@ def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, An
         _replaced(surface, surface_options) if isinstance(surface, Surface) else surface
         for surface in scene.surfaces
     ]
+    # Fields take the options of surfaces from the settings.
     if not all(isinstance(surface, Surface) for surface in surfaces):
         settings |= surface_options
     return surfaces, {**settings, **other_options}, scene.sources
@@ -297,6 +298,7 @@ def _of_scene_file(scene: SceneFile, arguments: Any, given_options: dict[str, An
 def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Content:
     """Return a surface file as content (its field, options, and where the field comes from). What
     the file was taken for is printed. given_options: the options that were given, by name."""
+    # `up` turns the field when the file is read, so it is no option of the picture.
     given_options = {name: value for name, value in given_options.items() if name != "up"}
     opened = field_from_file(path, **_file_options(arguments))
     print_line(f"{path}: {python_to_cli_terms(opened.summary)}")

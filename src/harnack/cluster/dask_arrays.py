@@ -53,10 +53,13 @@ def accepts_dask_arrays(*names: str) -> Callable[[Function], Function]:
             if not any(map(is_dask_array, (*positional, *settings.values()))):
                 return function(*positional, **settings)
             arguments = signature.bind(*positional, **settings).arguments
-            # The first argument, `self` of a method, is passed by position, all others by name.
+            # The first argument (a surface, or `self` of a method), which is no Dask array, is
+            # passed by position, all others by name. `variadic_name` is the name of the function's
+            # parameter **keywords, whose entries are arguments by name too.
             first_argument = arguments.pop(next(iter(signature.parameters)))
             named = {**arguments.pop(variadic_name, {}), **arguments}
-            # `wrapper`, and not `function`, as workers find the wrapper under the function's name.
+            # `names` are the arguments that may be Dask arrays. `wrapper` is called for each block,
+            # and not `function`, as workers find the wrapper under the function's name.
             return _map_blocks(functools.partial(wrapper, first_argument), names, named)
 
         return cast("Function", wrapper)
@@ -104,6 +107,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
     )
     # traverse=False: Dask need not look for Dask arrays in it.
     sent_call = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
+    # pure=False: Dask need not compute names from arguments, as names are given below.
     run_block = delayed(_run_block, pure=False)
     block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
     lengths: tuple[int, ...] = next(iter(dask_args.values())).chunks[0]
@@ -121,6 +125,7 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
         for name, array in empty_arrays.items():
             shape = (lengths[block_index], *array.shape[1:])
             outputs[name].append(dask_array.from_delayed(output[name], shape, array.dtype))
+    # The array of a function that returns no dataclass has the name "".
     result_arrays = {name: dask_array.concatenate(pieces) for name, pieces in outputs.items()}
     return type(empty_result)(**result_arrays) if is_dataclass(empty_result) else result_arrays[""]
 
@@ -154,7 +159,7 @@ def _align_blocks(
         shape = np.shape(array)
         # A number or a single point or direction belongs to all rows.
         if name not in dask_args and shape not in ((), (3,)) and shape[0] == count:
-            aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)
+            aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)  # one block
     for name, array in aligned.items():
         if array.ndim not in (1, 2) or (array.ndim == 2 and array.shape[1] != 3):
             raise ValueError(f"{name} must have shape (n, 3) or (n,), not {array.shape}")

@@ -144,6 +144,7 @@ class Executor:
         about so many of them. If it is not set but there is a client, they are made shorter until
         there are about six for each thread of its workers."""
         size = max(1, min(max_size, count))
+        # Quotients are rounded up.
         if self.chunks is not None:
             size = max(1, min(size, -(-count // self.chunks)))
         elif self.client is not None:
@@ -336,6 +337,7 @@ class _DaskTasks:
         finished = [future for future in self.names if future.status == "finished"]
         results: list[tuple[str, TaskResult]] = []
         # Without a scheduler there are no results to fetch; the error that is raised says so.
+        # (`_run_task` returns the arrays first.)
         with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
             self.client.cancel([future for future in self.names if future.status != "finished"])
             for future in finished:

@@ -131,13 +131,14 @@ class SerializedObject:
             ModuleNotFoundError: the extra `cluster` is not installed.
             TypeError: the object cannot be pickled.
         """
-        name, pickler = _hash_and_files(thing, label)
+        hash_text, pickler = _hash_and_files(thing, label)
+        # What is sent is another pickle than the one that is hashed.
         data = _pickle(_make_cacheless_pickler, thing, label).file.getvalue()
         files, other_versions = (
             sorted(pickler.files.items()),
             sorted(pickler.other_versions.items()),
         )
-        return cls(name, data, tuple(files), package_versions(), tuple(other_versions))
+        return cls(hash_text, data, tuple(files), package_versions(), tuple(other_versions))
 
     def deserialize(self) -> Any:
         """Unpickle the object. The four objects that were deserialized last in this process are
@@ -252,9 +253,10 @@ def _pickle(
                 "of arrays, numbers and the classes of this library"
             ) from error
         identifiers = frozenset(pickler.words)
-        # The pickler is complete if no module has further attributes whose names are words now.
-        if all(len(attributes_named(*module)) == len(attributes_named(module[0], identifiers))
-               for module in pickler.modules):  # fmt: skip
+        # The pickler is complete if no module has further attributes whose names are words now. A
+        # pair is a module and the words that were known when it was written.
+        if all(len(attributes_named(*pair)) == len(attributes_named(pair[0], identifiers))
+               for pair in pickler.modules):  # fmt: skip
             return pickler
 
 
@@ -374,6 +376,8 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
             self.modules.append((module, words))
             attributes = attributes_named(module, words)
             left_out = frozenset(vars(module)) - frozenset(attributes)
+            # Pickle's form: a function, its arguments, the state, no items of lists and of
+            # dictionaries, and the function that sets the state.
             return itself, (self.space(vars(module)),), (attributes, left_out), None, None, fill
 
         def of_function(self, function: FunctionType, reduced: Any) -> Any:
@@ -386,6 +390,7 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return reduced
             refuse_imports_within(function)
             self.words |= words_of(function)
+            # Of cloudpickle's arguments, the code and the closure are kept, but not the globals.
             _, (code, _, _, _, closure), *rest = cast("tuple[Any, ...]", reduced)
             return function_in, (self.space(function.__globals__), code, closure), *rest
 
@@ -471,7 +476,8 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             changes from run to run. The name of a file is replaced by a hash of the file.
             """
             obj_type = cast("type[Any]", type(obj))
-            if id(obj) in self.begun:  # classes, functions and modules may name themselves
+            # Classes, functions and modules may name themselves. An entry is (object, number).
+            if id(obj) in self.begun:
                 return f"number {self.begun[id(obj)][1]}"
             if obj_type is set or obj_type is frozenset:  # whose order differs
                 members = cast("set[Any] | frozenset[Any]", obj)
@@ -509,13 +515,14 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
             self.note_origin(obj)
             reduced = base_pickler.reducer_override(self, obj)
             is_code = isinstance(obj, type | FunctionType | ModuleType)
-            # What pickle would do as usual is asked for here; a definition is described by its
-            # name.
+            # What pickle would do as usual is asked for here, unless cloudpickle has a function for
+            # the type (in `dispatch_table`); a definition is described by its name.
             if reduced is NotImplemented and type(obj) not in base.dispatch_table:
                 reduced = obj.__qualname__ if is_code else obj.__reduce_ex__(_PROTOCOL)
             # An object that is described by its name only.
             if isinstance(reduced, str):
                 return tuple, ([str(getattr(obj, "__module__", None)).encode(), reduced.encode()],)
+            # A description without a state (the third entry) holds no names of attributes.
             if not isinstance(reduced, tuple) or len(cast("tuple[Any, ...]", reduced)) < 3:
                 return cast("Any", reduced)
             constructor, arguments, state, *rest = cast("tuple[Any, ...]", reduced)

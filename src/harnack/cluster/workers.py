@@ -118,7 +118,8 @@ def _check_workers(client: Any) -> None:
     Raises:
         RuntimeError: a worker has other versions, or cannot compute.
     """
-    # A function of the standard library, which every worker has.
+    # A function of the standard library, which every worker has. In place of the result of a worker
+    # that fails stands its error.
     versions = client.run(importlib.metadata.version, "harnack", on_error="return")
     local_version = importlib.metadata.version("harnack")
     for address, version in versions.items():
@@ -128,6 +129,8 @@ def _check_workers(client: Any) -> None:
                 f"worker {address} has {remote}, and here it is {local_version}: "
                 f"{_INSTALL.format(version=local_version)}"
             )
+    # A state is a pair: the versions of packages, and the fingerprint of rounding. In place of the
+    # state of a worker that fails stands its error.
     states = client.run(_worker_state, on_error="return")
     for address, state in states.items():
         if isinstance(state, BaseException):

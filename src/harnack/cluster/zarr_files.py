@@ -68,7 +68,7 @@ def to_zarr(
         and not _chunk_path(file, target, index).exists()
     ]
     blocks = array.to_delayed()
-    write = dask.delayed(_write_block, pure=False)
+    write = dask.delayed(_write_block, pure=False)  # it has an effect, so each call counts
     tasks = [
         write(str(target), _chunk_slices(array, index), blocks[index]) for index in missing_chunks
     ]

@@ -309,6 +309,7 @@ def _partial_name(target: Path) -> Path:
     renamed to `target`. If the target's name is long, this name is not longer, so that the file
     system accepts it as well."""
     token = f".{secrets.token_hex(4)}.partial"
+    # The stem is cut by the bytes of the token and of the dot before it.
     stem = os.fsencode(target.stem)
     prefix = os.fsdecode(stem[: max(0, len(stem) - len(token) - 1)])
     return target.with_name(f".{prefix}{token}{target.suffix}")

@@ -150,6 +150,7 @@ def _joined_polylines(contents: FileGeometry) -> list[LocatedLoop]:
     x, welded = contents.vertices, weld_vertices(contents.vertices)
     loops: list[LocatedLoop] = []
     open_edges: list[Edge] = []
+    # For the number of a vertex, the place of a polyline that contains it.
     places: dict[int, FileLocation] = {}
     for corners, place in contents.polylines:
         # All vertices at the same position have the same number here.
@@ -319,6 +320,7 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
         FileFormatError: the file cannot be read, or not in this way.
     """
     if kind == ".blobs":
+        # (): these files can be read in one way only, and `read_as` must be None.
         _check_convertible(path, read_as, (), "blobs")
         return read_metaballs(path, read_bytes(path))
     if kind in MOLECULE_FILES:
@@ -429,18 +431,19 @@ def _mesh(contents: FileGeometry) -> LoadedMesh:
     net_faces, singular = welded.net, welded.edges
     if not len(net_faces.faces):
         raise MeshError(f"its {len(faces):,} faces cancel each other: there is no surface")
-    count = f"{len(faces):,} triangles"
+    count_text = f"{len(faces):,} triangles"
     if len(singular) == 0:
-        summary = f"{count} without singular edges: a closed mesh"
+        summary = f"{count_text} without singular edges: a closed mesh"
         center = vertices.mean(axis=0)
         # Six times the enclosed volume; negative if faces look inward.
         if np.linalg.det(vertices[faces] - center).sum() < 0.0:
             summary += ", whose faces look inward (the winding number inside is negative)"
     elif len(singular) >= len(faces):
-        summary = f"{count}, {len(singular):,} singular edges: a triangle soup"
+        summary = f"{count_text}, {len(singular):,} singular edges: a triangle soup"
     else:
         summary = (
-            f"{count}, {len(singular):,} singular edges: a mesh with holes or faces turned round"
+            f"{count_text}, {len(singular):,} singular edges: a mesh with holes or faces turned "
+            "round"
         )
     if welded.rounded:
         # Each vertex gets the position of the vertex that it was joined with.
@@ -493,12 +496,12 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
     """Make a point cloud of the vertices of a file without faces, with their normals if it has
     them."""
     points = as_cloud_points(contents.vertices)
-    count = f"{len(points):,} points"
+    count_text = f"{len(points):,} points"
     if contents.normals is None:
-        summary = f"{count} without faces, and no normals read: a point cloud"
+        summary = f"{count_text} without faces, and no normals read: a point cloud"
         return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
-    return LoadedCloud(points, normals, None, f"{count} with normals, no faces: a point cloud")
+    return LoadedCloud(points, normals, None, f"{count_text} with normals, no faces: a point cloud")
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:

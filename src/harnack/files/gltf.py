@@ -80,6 +80,7 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
     """
     text = data
     if place.path.suffix.lower() == ".glb":
+        # Twenty bytes precede the JSON header.
         if len(data) < 20 or data[:4] != b"glTF":
             raise place.error("this is no .glb file: it does not begin with 'glTF'")
         # A .glb file begins with "glTF", the version and the file's length; then come the length of
@@ -150,7 +151,7 @@ def _check_header(place: FileLocation, header: dict[str, Any], size: int) -> Non
     for accessor in accessors:
         element_bytes = _COMPONENT_BYTES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
         total += _count(accessor, "count") * element_bytes
-        _count(accessor, "byteOffset", 0)
+        _count(accessor, "byteOffset", 0)  # raises the error of a wrong offset
     # Of small files, 64 KiB count as their size.
     if total > 8 * max(size, 1 << 16):
         raise place.error(

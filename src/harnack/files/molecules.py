@@ -83,6 +83,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
     except (RuntimeError, ValueError, IndexError, UnicodeError) as error:
         first = " ".join(str(error).split())
         raise place.error(f"the molecule cannot be read ({first})") from None
+    # The number of atoms of each model, alternatives included.
     sizes = [model.count_atom_sites() for model in structure]
     # Only the first model counts.
     atoms = _drop_alternate_locations(structure[0]) if sizes else []
@@ -98,6 +99,7 @@ def parse_molecule(path: Path, data: bytes) -> Atoms:
         raise place.error(
             f"atom {known_atoms[invalid[0]].serial} has coordinates that are not finite"
         )
+    # gemmi's radii are rounded to single precision: 1.7 is 1.70000005 there.
     radii = np.array([round(atom.element.vdw_r, 6) for atom in known_atoms], dtype=np.float64)
     elements = tuple(atom.element.name for atom in known_atoms)
     left_out = {
@@ -176,7 +178,8 @@ def _check_coordinates(path: Path, text: str) -> None:
                     "ATOM and HETATM begin in column 1"
                 )
             continue
-        # The decimal points of the three numbers must be in the same column of each.
+        # The decimal points of the three numbers must be in the same column of each. Counted from
+        # 0, the numbers begin in columns 30, 38 and 46.
         dot_columns = {line[k : k + 8].find(".") for k in (30, 38, 46)}
         if len(dot_columns) > 1 and not any(c.isspace() for c in line[30:54]):
             raise FileLocation(path, f"line {number}").error(

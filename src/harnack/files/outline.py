@@ -168,7 +168,8 @@ def _path_to_loops(points: FloatArray, codes: list[int], max_error: float) -> li
             k += 1
             continue
         count = _POINTS_OF_CODE[code]
-        # A line or a curve begins at the last point so far.
+        # A line or a curve begins at the last point so far. `flatten_bezier` returns the points of
+        # a polyline without the first one, and a bound of its error.
         controls = np.concatenate([loop_pieces[-1][-1][-1:], points[k : k + count]])
         loop_pieces[-1].append(
             flatten_bezier(controls, max_error)[0] if count > 1 else controls[1:]
@@ -228,6 +229,7 @@ def svg(
         raise FileFormatError(f"{source}: an SVG file has at most {_MAX_SVG_BYTES >> 20} MB")
     try:
         root = _parse_svg(source.read_bytes())
+        # The root has no transform before it, and inherits no styles.
         shapes = [*_filled_shapes(root, np.eye(3), {})]
         return _outline_of(shapes, scale, tolerance)
     except (ValueError, ArithmeticError, LookupError, ParseError, expat.ExpatError) as wrong:
@@ -271,7 +273,7 @@ def _parse_svg(data: bytes) -> Element:
     parser.StartElementHandler, parser.EndElementHandler = start_element, end_element
     parser.CharacterDataHandler = builder.data
     parser.EntityDeclHandler = refuse_entity
-    parser.Parse(data, True)
+    parser.Parse(data, True)  # True: these are all bytes
     root = builder.close()
     if root.tag != "svg":
         raise ValueError(f"its root is <{root.tag}>, and not <svg>")
@@ -460,12 +462,15 @@ def _loops(segments: list[Any], matrix: FloatArray, tolerance: float) -> list[Fl
         if kind == "Arc":
             loop_pieces[-1].append(_arc(segment, matrix, tolerance))
             continue
+        # The control points; of a line these are its two ends.
         controls = _transform_points(matrix, [*segment.bpoints()])
         if not np.isfinite(controls).all():
             raise ValueError("a number in it is not finite")
+        # All points but the first, which the polygon has already.
         loop_pieces[-1].append(
             flatten_bezier(controls, tolerance)[0] if len(controls) > 2 else controls[1:]
         )
+    # The pieces of each polygon are joined to one array.
     return _drop_degenerate_loops([np.concatenate(segment) for segment in loop_pieces])
 
 

@@ -263,6 +263,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     # Beside faces, edges with other property names are not needed.
     if table and (table.has_scalars("vertex1", "vertex2") or not tables.get("face")):
         ends = np.stack([table.scalar_column("vertex1"), table.scalar_column("vertex2")], axis=1)
+        # Each edge is a polyline of two vertices.
         edges = _polygons(table, ends.ravel(), np.full(len(ends), 2), len(vertices))
     # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
@@ -275,8 +276,8 @@ def _check_elements(path: Path, header: PlyHeader) -> None:
     faces in a form that is not supported, such as strips of triangles."""
     names = [section.name for section in header.elements]
     for name in names:
-        is_odd = name.lower() in ("vertex", "face", "edge") and name != name.lower()
-        if name.lower() in _UNSUPPORTED_FACE_ELEMENTS or is_odd:
+        has_capitals = name.lower() in ("vertex", "face", "edge") and name != name.lower()
+        if name.lower() in _UNSUPPORTED_FACE_ELEMENTS or has_capitals:
             raise FileLocation(path).error(
                 f"its element {name[:40]!r} is not read: triangles are rows of the element 'face'"
             )
@@ -304,7 +305,7 @@ def _polygons(
     count: the number of vertices.
     """
     polygons = PolygonList(corners.astype(np.int64), sizes, table.places)
-    # Indices are read as floats only if one of them is not whole.
+    # Indices are read as floats only if one of them is not whole. argmax finds the first such one.
     if corners.dtype.kind == "f" and corners.size:
         k = int(np.argmax(corners != np.rint(corners)))
         raise polygons.location_of_corner(k).error(
@@ -330,7 +331,7 @@ def _columns(
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
     for prop in section.properties:
-        if prop.length_code is None:
+        if prop.length_code is None:  # a single number, with no lengths of lists
             columns[prop.name] = PropertyColumn(prop.code, positions, offset, None)
             offset += values.width(prop.code)
             continue
@@ -375,6 +376,7 @@ def _text_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elemen
             how = "few" if ends[wrong[0]] > np.cumsum(counts)[wrong[0]] else "many"
             raise places[wrong[0]].error(f"{counts[wrong[0]]} numbers are too {how}")
         tables[section.name] = ElementTable(values, columns, places)
+    # The first line after all rows, if there is one.
     _check_end(path, b"".join(lines.text[:1]))
     return tables
 
@@ -393,6 +395,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
     tables: dict[str, ElementTable] = {}
     begin = header.size
     for section in header.elements:
+        # The length of a row whose lists are all empty.
         min_stride = sum(values.width(p.length_code or p.code) for p in section.properties)
         if section.count * min_stride > values.size - begin:
             raise _too_short(path, section)
@@ -403,8 +406,8 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             # In most files the lists of all rows are as long as those of the first row, and not
             # empty.
             stride = next(_row_ends(section, values, begin)) - begin
-            # Then all lists of the first row are empty. Rows without data could be declared in any
-            # number, so their number is checked.
+            # A file could declare any number of rows with empty lists only, which take few bytes.
+            # If the first row is one, the number of rows is checked.
             if stride == min_stride and any(p.length_code for p in section.properties):
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
             begins = begin + stride * np.arange(section.count, dtype=np.int64)
@@ -412,6 +415,7 @@ def _binary_tables(path: Path, data: bytes, header: PlyHeader) -> dict[str, Elem
             if (ends != begins + stride).any() or ends[-1] > values.size:
                 check_element_count(FileLocation(path), header.declared_rows(len(data)))
                 ends = np.fromiter(_row_ends(section, values, begin), np.int64, section.count)
+                # Each row begins where the one before ends.
                 columns, _ = _columns(section, values, np.append(begin, ends[:-1]), places)
         except struct.error:
             raise _too_short(path, section) from None
@@ -478,6 +482,7 @@ def _header(path: Path, data: bytes) -> PlyHeader:
     size = newline + 1 if newline >= 0 else len(data)
     byte_order: str | None = None
     sections: list[PlyElement] = []
+    # Line 1 is the word "ply".
     for number, line in enumerate(data[:end].splitlines()[1:], 2):
         place = FileLocation(path, f"line {number}")
         words = line.split()
@@ -520,6 +525,7 @@ def _parse_property(words: list[bytes], section: PlyElement, place: FileLocation
             integer.
     """
     types = words[2:4] if words[1:2] == [b"list"] else words[1:2]
+    # A list has two types: of its length, and of its numbers.
     if len(words) != (5 if len(types) == 2 else 3) or any(t not in _CODES for t in types):
         raise place.error("a property is 'property TYPE NAME' or 'property list TYPE TYPE NAME'")
     name = words[-1].decode("ascii", "backslashreplace")

@@ -65,6 +65,7 @@ def read_xyz(path: Path, data: bytes) -> FileGeometry:
         return FileGeometry(path, table[:, :3])
     normals = table[:, 3:6]
     length = np.linalg.norm(normals, axis=1)
+    # Normals with few digits are not exactly of unit length.
     wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
     if wrong.size:
         raise lines.locations[wrong[0]].error(
@@ -92,8 +93,9 @@ def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocat
         raise lines.locations[wrong[0]].error(
             f"{counts[wrong[0]]} numbers: a loop is x y z repeated, so a multiple of 3"
         )
-    points = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
-    return [(loop, lines.locations[k]) for k, loop in enumerate(points)]
+    # All points, divided where a line ends.
+    loops = np.split(numbers.reshape(-1, 3), np.cumsum(counts // 3)[:-1])
+    return [(loop, lines.locations[k]) for k, loop in enumerate(loops)]
 
 
 # Metaballs.
@@ -217,11 +219,13 @@ def read_obj(path: Path, data: bytes) -> FileGeometry:
         for k, (text, numbers) in statements.items()
     }
     vertices = read_table(rows[b"v"], 3, too_few_message="a vertex needs three coordinates, not {}")
+    # The least numbers of corners are 3 and 2.
     faces = _parse_obj_polygons(rows[b"f"], "'f' needs at least 3 vertices", 3, rows[b"v"])
     polylines = _parse_obj_polygons(rows[b"l"], "'l' needs at least 2 vertices", 2, rows[b"v"])
     # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), len(lines))
+    # Normals are needed for point clouds only.
     if len(faces) or len(polylines):
         return FileGeometry(path, vertices, None, faces, polylines)
     normals = read_table(rows[b"vn"], 3) if len(rows[b"vn"]) else None
@@ -251,6 +255,7 @@ def _parse_obj_points(
     normal_words = [word[2] for word in words if len(word) == 3 and word[2]]
     if normals is None or not normal_words:
         return FileGeometry(path, vertices[points.corners])
+    # Errors name the first of these statements.
     normal_indices = [parse_vertex_index(word, rows[b"p"].locations[0]) for word in normal_words]
     if len(normal_indices) != len(words) or not all(1 <= k <= len(normals) for k in normal_indices):
         raise (
@@ -384,6 +389,7 @@ def _integers(
     Raises:
         FileFormatError: a number is no integer.
     """
+    # Below 2^53, floats hold integers exactly.
     wrong = np.flatnonzero(~((numbers == np.rint(numbers)) & (np.abs(numbers) < 2.0**53)))
     if wrong.size:
         # Parsing the first wrong word alone raises the error that names it.
@@ -399,6 +405,8 @@ def _parse_off_header(path: Path, lines: TextLines) -> tuple[int, int, TextLines
     Raises:
         FileFormatError: it is malformed, or not supported.
     """
+    # Letters before OFF announce texture coordinates, colors and normals, which are ignored; "4"
+    # and "n" announce another number of coordinates.
     match = (
         re.match(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?!\S)\s*(.*)", lines.text[0]) if len(lines) else None
     )
@@ -444,6 +452,7 @@ def read_stl(path: Path, data: bytes) -> FileGeometry:
     corners = _parse_binary_stl(path, data) if _is_binary(data) else _parse_text_stl(path, data)
     if not len(corners):
         raise FileLocation(path).error("it holds no triangles")
+    # One row for each triangle, so that errors name the triangle.
     check_finite(corners.reshape(-1, 9), FileLocations(path, "triangle", range(len(corners) // 3)))
     distinct, index = np.unique(weld_vertices(corners), return_inverse=True)
     return FileGeometry(

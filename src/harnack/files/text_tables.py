@@ -111,12 +111,13 @@ def parse_vertex_index(word: bytes, place: FileLocation) -> int:
         FileFormatError: the word is not such an integer.
     """
     try:
-        value = int(b"" if b"_" in word else word)
+        value = int(b"" if b"_" in word else word)  # Python reads 1_0 as 10; int(b"") fails
     except ValueError:
         # Some programs write 3 as 3.000e+00.
         if not _is_integral(word):
             raise place.error(f"{excerpt(word)} is not an integer") from None
         value = int(float(word))
+    # It must fit into 64 bits, also after numbers of vertices were added.
     if abs(value) >= 2**62:
         raise place.error(f"vertex {value} is out of range: no file has as many")
     return value

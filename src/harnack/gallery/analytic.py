@@ -68,6 +68,7 @@ def _periodic(kind: Any, half_wall: float, *, box: bool = False) -> list[Surface
     box: whether it is cut to a box; otherwise to a ball.
     """
     domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if box else Ball(radius=1.0)
+    # The first argument is the period along each axis.
     return [Surface(kind(1.0, domain=domain), (-half_wall, half_wall), side="between")]
 
 
@@ -117,8 +118,9 @@ def _fitted_knot() -> list[Surface]:
     """Return a solid around a trefoil knot. Its field is a sum of Gaussians along the knot,
     approximated by a series of 16 x 16 x 9 cosines."""
     curve = example_curves.torus_knot(2, 3, 150)
-    step = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
-    # The Gaussians' width, and the lengths of the curve's edges as weights of the sum.
+    # The lengths of the curve's edges are the weights of the sum.
+    edge_lengths = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)
+    # The Gaussians' width.
     width = 0.15 * float(np.ptp(curve, axis=0).max()) / 2
 
     def density(x: FloatArray) -> FloatArray:
@@ -127,7 +129,7 @@ def _fitted_knot() -> list[Surface]:
         so that it is about 1 on the curve."""
         # In batches, as the array of all distances would take much memory.
         sums = [
-            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ step
+            np.exp(-((batch[:, None] - curve) ** 2).sum(axis=2) / width**2) @ edge_lengths
             for batch in np.array_split(x, len(x) // 4000 + 1)
         ]
         return np.concatenate(sums) / (width * math.sqrt(math.pi))

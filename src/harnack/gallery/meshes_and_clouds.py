@@ -22,7 +22,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 def _cut_mesh() -> list[Surface]:
     """Return a bumpy sphere with 14 round holes, closed by the level set of its winding number."""
-    vertices, faces = example_meshes.bumpy_sphere(6)
+    vertices, faces = example_meshes.bumpy_sphere(6)  # subdivided six times
     directions = vertices[faces].mean(axis=1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     # Faces within 0.27 radians of one of 14 directions are left out.
@@ -41,11 +41,13 @@ def _spiral_directions(n: int) -> FloatArray:
 def _soup() -> list[Surface]:
     """Return the level set of the winding number of loose triangles: a torus whose triangles are
     shrunk about their centers, with a tenth of them missing."""
+    # The two radii, and the numbers of segments the long way round and the short way.
     vertices, faces = example_meshes.torus_mesh(1.0, 0.42, 20, 9)
     faces = example_meshes.remove_faces(faces, 0.1, seed=1)
     corners = vertices[faces]
     centers = corners.mean(axis=1, keepdims=True)
     shrunk = (centers + 0.86 * (corners - centers)).reshape(-1, 3)
+    # Every triangle has three corners of its own.
     field = WindingNumber(shrunk, np.arange(len(shrunk)).reshape(-1, 3))
     return [Surface(field)]
 

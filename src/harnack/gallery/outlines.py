@@ -51,10 +51,12 @@ _WORD: tuple[tuple[int, ...], ...] = (
 
 def _nameplate() -> list[Surface]:
     """Return a plate with round ends and a hole, and a word in raised letters on it."""
+    # The round ends are half circles of radius 0.75 about x = 4.2 and x = -0.6.
     angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 90)
     right = np.column_stack([4.2 + 0.75 * np.cos(angle), 0.75 * np.sin(angle)])
     left = np.column_stack([-0.6 - 0.75 * np.cos(angle), -0.75 * np.sin(angle)])
     (hole,) = outline.regular_polygon(120, 0.25)
+    # The second argument of an extrusion is its height.
     plate = Extrusion([np.concatenate([right, left]), hole - (0.65, 0.0)], 0.2)
     letters = [np.reshape(loop, (-1, 2)) / 1000.0 - (0.0, 0.37) for loop in _WORD]
     # A little way into the plate, so that no faces coincide.

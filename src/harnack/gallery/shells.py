@@ -29,6 +29,7 @@ _PATCH_OPTIONS = TraceOptions(tolerance=1e-5)
 
 def _exoskeleton() -> list[Surface]:
     """Return a wavy torus of some 150 nonplanar polygons, and tubes around their edges."""
+    # The two radii, and the numbers of segments the long way round and the short way.
     vertices, faces = example_meshes.torus_mesh(1.0, 0.45, 240, 108)
     angle = np.arctan2(vertices[:, 1], vertices[:, 0])
     # The center line of the torus goes up and down three times, and its tube is thicker and
@@ -36,6 +37,7 @@ def _exoskeleton() -> list[Surface]:
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.25 * np.sin(3 * angle)])
     across = vertices - np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
     wavy = ring + across * (1 + 0.25 * np.cos(3 * angle))[:, None]
+    # About 150 polygons, whose edges are smoothed twelve times; the tubes have the radius 0.011.
     mesh = PolygonMesh(*cluster_into_polygons(wavy, faces, 150, smoothing=12))
     tubes = TubeNetwork(mesh.vertices, mesh.edges, 0.011)
     return [Surface(mesh), Surface(tubes)]
@@ -102,6 +104,7 @@ class GridShell:
     def field(self) -> SolidAngle:
         """Return the solid angle of the outline and the holes, a function of space. The shell is
         its level set at `level`."""
+        # The normals of the circles point down: holes run clockwise.
         corners = np.column_stack([self.outline, np.zeros(len(self.outline))])
         return SolidAngle([corners, *(Circle(r, (x, y, 0), (0, 0, -1)) for x, y, r in self.holes)])
 

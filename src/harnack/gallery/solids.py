@@ -46,9 +46,11 @@ def _metaballs() -> list[Surface]:
     out of it."""
     angle = np.linspace(0, 2 * math.pi, 9, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0.35 * np.sin(3 * angle)])
+    # The large ball, the nine drops, and the blob that carves.
     centers = np.concatenate([[[0.0, 0.0, 0.0]], 1.15 * ring, [[0.35, -0.55, 0.5]]])
     radii = np.concatenate([[0.72], 0.26 + 0.06 * np.cos(2 * angle), [0.42]])
     weights = np.array([1.0] * 10 + [-1.2])
+    # A blob ends at 1.8 of its radius; the solid is where the sum is at least 1.
     return _solid(Blobs(centers, radii, weights, kernel=CompactKernel(1.8)), 1.0)
 
 
@@ -59,6 +61,7 @@ def _groups() -> list[Surface]:
     flat = np.column_stack([np.cos(angle) - 0.5, np.sin(angle), 0 * angle])
     upright = np.column_stack([np.cos(angle) + 0.5, 0 * angle, np.sin(angle)])
     centers = np.concatenate([flat, upright])
+    # All blobs have the radius 0.3; the solid is where the sum of a group is at least 1.
     return _solid(Blobs(centers, 0.3, groups=[0] * 12 + [1] * 12), 1.0)
 
 
@@ -67,6 +70,8 @@ def _through_points() -> list[Surface]:
     points, normals = [], []
     for j in range(6):
         for k in range(3):
+            # The angles around the axis and around the tube; every other ring is turned by half a
+            # step.
             u, v = 2 * math.pi * j / 6, 2 * math.pi * (k + 0.5 * (j % 2)) / 3
             radial = np.array([math.cos(u), math.sin(u), 0.0])
             normal = math.cos(v) * radial + math.sin(v) * np.array([0.0, 0.0, 1.0])
@@ -179,6 +184,7 @@ def _letters() -> list[Surface]:
     for start, curves in _LETTERS:
         for curve in curves:
             x, z = np.reshape(curve, (4, 2)).T
+            # The word is moved to the origin, and bent like a wave along y.
             controls = np.column_stack([x + start - 4.7, 0.25 * np.sin(x + start), z - 1.0])
             tubes.append(Tube.bezier(controls, 0.13, tolerance=2e-3))
     return _drawn(union(*tubes))

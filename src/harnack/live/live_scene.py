@@ -278,6 +278,7 @@ class LiveScene:
         coordinates."""
         orbit, placement = self.framing.camera, self.placement
         azimuth, elevation = np.radians([orbit["azimuth"], orbit["elevation"]])
+        # The unit vector (cos e cos a, cos e sin a, sin e) from the target to the camera.
         to_camera = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)]) * np.cos(
             elevation
         )
@@ -595,7 +596,8 @@ def _kernel_data(
         }  # fmt: skip
 
     kernel = record_kernel(compute, lanes, placed)
-    # The test rays and Dr.Jit's results for them, as words in the order of the shader.
+    # The test rays and Dr.Jit's results for them, as words in the order of the shader. The label of
+    # an entry is its path, such as "lane o 0" for the x of the origins.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
     # All results but the last, the color, must differ between rays.
@@ -694,6 +696,7 @@ def surface_colors(body: StudioObject) -> list[JsonDict]:
     section_material = body.material if body.section_material is None else body.section_material
     front, back, glossy = _reflectances(section_material.bsdf(solid=is_solid, traced_light=False))
     paints.append(_paint(front, back, glossy))
+    # Lines are the same on both sides, and not glossy.
     lines = [mi.Color3f(*linear_from_srgb(line.srgb)) for line in body.isolines]
     return [*paints, *(_paint(line, line, False) for line in lines)]
 
@@ -717,7 +720,7 @@ def _reflectances(bsdf: Mapping[str, Any]) -> tuple[Any, Any, bool]:
     colors: list[Any] = []
     for side in (1, -1):
         si = dr.zeros(mi.SurfaceInteraction3f)
-        # Light along the normal, on either side.
+        # Light along the normal, on either side. A finite t marks the interaction as valid.
         si.wi, si.t = mi.Vector3f(0, 0, side), mi.Float(1)
         diffuse = mi.Color3f(plugin.eval_diffuse_reflectance(si, True))
         colors.append(reflectance(diffuse, mi.Bool(False)))

@@ -115,6 +115,7 @@ class PreviewRenderer:
         has_floor = show == "shaded" and eye.origin[2] > FLOOR_HEIGHT
         camera_vectors = [eye.origin, eye.right, eye.up, eye.forward]
         cache_key = painted, np.ravel(camera_vectors).tolist(), eye.pixel, size, has_floor
+        # The first entry of the key, the list of surfaces, is compared by identity.
         if (
             self._hit_cache is None
             or self._hit_cache[0][0] is not painted
@@ -122,7 +123,7 @@ class PreviewRenderer:
         ):
             self._hit_cache = cache_key, self._trace(mi, painted, eye, size, has_floor=has_floor)
             dr.eval(self._hit_cache[1])
-        hits = self._hit_cache[1]
+        hits = self._hit_cache[1]  # the cache is a pair (key, hits)
         if show != "shaded":
             return _aov_preview(hits, show, AOV_BACKGROUNDS[ground], size)
         # The shadow is computed first: it evaluates arrays, and whatever was recorded before
@@ -154,6 +155,7 @@ class PreviewRenderer:
         linear = dr.clip(dr.select(hits["lost"], mi.Color3f(OUT_OF_STEPS_COLOR), linear), 0, 1)
         srgb = linear_to_srgb(linear, dr.select)
         red, green, blue = (mi.UInt32(255 * part + 0.5) for part in srgb)
+        # In little-endian order the bytes of a word are red, green, blue and opacity.
         packed = red | (green << 8) | (blue << 16) | (255 << 24)
         return Preview(to_numpy(packed).astype("<u4").view(np.uint8).reshape(size[1], size[0], 4))
 
@@ -184,6 +186,7 @@ class PreviewRenderer:
         )
         origin = _vector(mi, eye.origin)
         vector = mitsuba_backend(mi).Array3f
+        # Adding zeros gives the origins the width of the directions.
         o = vector(origin) + dr.zeros(vector, dr.width(d))
         # The nearest hit so far: the floor, if the ray goes down to it.
         t, normal, color = mi.Float(dr.inf), mi.Vector3f(0, 0, 1), mi.Color3f(0)
@@ -290,6 +293,7 @@ def _aov_preview(
     elif show == "depth" and met.any():
         t = to_numpy(hits["t"])[met]
         depths = float(t.min()), float(t.max())
+        # The divisor has a lower limit, for hits that all have the same depth.
         share = (t - depths[0]) / max(depths[1] - depths[0], 1e-12)
         picture[met] = (NEAR_GRAY + share * (FAR_GRAY - NEAR_GRAY))[:, None]
     elif show == "evaluations":

@@ -103,7 +103,7 @@ def check_sources(sources: Any) -> None:
     field's entry in a scene file."""
     try:
         is_right = all(
-            isinstance(field, Field) and isinstance(text, dict) for field, text in sources
+            isinstance(field, Field) and isinstance(entry, dict) for field, entry in sources
         )
     except (TypeError, ValueError):
         is_right = False
@@ -141,6 +141,7 @@ class SceneFile:
         """The surfaces, each with those options of the scene that are keywords of `Surface`
         (level, clip, ...). `harnack.trace` and other functions of a `Surface` take them."""
         shorthand = {k: value for k, value in self.settings.items() if k in SURFACE_OPTIONS}
+        # Of the two results, the surface and the options of traces, the surface.
         return tuple(
             surface_and_options("a scene", surface, None, shorthand, SURFACE_OPTIONS)[0]
             for surface in self.surfaces
@@ -298,6 +299,7 @@ def _json(value: Any, depth: int = 0) -> str:
     """Return a value as JSON text with a line for each entry; an entry that fits on one line, such
     as a row of numbers, stays on one line. depth: the depth of nesting, by which the text is
     indented."""
+    # Lines have at most 88 characters.
     one_line = json.dumps(value, allow_nan=False)
     if len(one_line) <= 88 - 2 * depth or not isinstance(value, dict | list):
         return one_line
@@ -374,7 +376,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             f"a {type(field).__name__} that was made in Python cannot be written into a scene "
             "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
         )
-    # The field is read back to find out whether its arguments say all of it.
+    # The field is read back to find out whether its arguments say all of it. It names no files.
     data = _object_to_json(field)
     _check_round_trip(field, _field_of(data, "field", None))
     return data
@@ -437,7 +439,7 @@ def _to_json_value(value: Any) -> Any:
         return int(cast("Any", value))
     if isinstance(value, Sequence):
         return [_to_json_value(entry) for entry in cast("Sequence[Any]", value)]
-    if isinstance(value, Field):
+    if isinstance(value, Field):  # a field in another object, without an entry of its own
         return _field_to_json(value, ())
     if type(value).__name__ in _constructible_types():
         return _object_to_json(value)
@@ -467,6 +469,7 @@ def _setting_to_json(name: str, value: Any, sources: FieldSources) -> Any:
     """
     _check_name(name, _KNOWN, "setting")
     if isinstance(value, HitTolerance):
+        # All else must be as a length alone makes it.
         if value != HitTolerance(value.distance):
             raise SceneFileError("tolerance: only a length can be written")
         return value.distance
@@ -519,6 +522,7 @@ def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
         SceneFileError: the data is no scene; the message names the part that is wrong.
     """
     scene_data = _object(data, "a scene")
+    # In Python, true equals 1.
     if scene_data.get("harnack") != VERSION or scene_data["harnack"] is True:
         raise SceneFileError(f'it must say "harnack": {VERSION}, the version of scene files')
     for name in scene_data:
@@ -664,15 +668,15 @@ def _gallery_surface(data: Plain) -> Surface:
     return surfaces[number]
 
 
-def _source_of(text: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
+def _source_of(entry: Any, where: str, find: Callable[[str], Path] | None) -> Field | None:
     """Return the field of a surface of the gallery or of a file; None if the entry describes
     another kind of field.
 
-    text: the entry, JSON data.
+    entry: JSON data.
     where: the place in the file, for messages.
     find: returns the path of a named file; None refuses named files.
     """
-    data = _object(text, f"{where}: field")
+    data = _object(entry, f"{where}: field")
     if "scene" in data:
         return _gallery_surface(data).field
     if "file" not in data:
@@ -742,7 +746,7 @@ def _from_json_value(value: Any, where: str) -> Any:
         return value
     data = cast("Plain", value)
     if "curves" in data or "formula" in data:
-        return _field_of(data, where, None)
+        return _field_of(data, where, None)  # None: it names no files
     # Any other object is a class name with arguments.
     kinds = _constructible_types()
     if len(data) != 1:
@@ -787,7 +791,7 @@ def _settings_of(data: Plain, known: Sequence[str]) -> Plain:
             settings[name] = _construct(Camera, value, name)
         elif name == "isolines":
             listed = cast("list[Any]", value if isinstance(value, list) else [value])
-            settings[name] = [_construct(Isolines, style, name) for style in listed]
+            settings[name] = [_construct(Isolines, entry, name) for entry in listed]
         else:
             plain = _from_json_value(value, name)
             # Lists of materials and levels stay lists, which is how `render` knows several from

@@ -60,6 +60,7 @@ class LiveView:
     def wait(self) -> None:
         """Wait until Ctrl-C is pressed, or until the view is closed elsewhere."""
         try:
+            # Short waits, between which Ctrl-C is noticed.
             while not self._ended.wait(0.2):
                 pass
         except KeyboardInterrupt:
@@ -229,6 +230,7 @@ class _PageServer:
         def serve() -> None:
             """Run the event loop until the view is closed, and then end everything that waits for
             it."""
+            # `runner` answers requests; `ended` tells the `LiveView` that nothing runs any more.
             asyncio.set_event_loop(loop)
             try:
                 loop.run_forever()
@@ -245,7 +247,7 @@ class _PageServer:
         try:
             bound_port = asyncio.run_coroutine_threadsafe(begin(), loop).result()
         except OSError as wrong:
-            LiveView("", loop, ended).close()
+            LiveView("", loop, ended).close()  # ends the thread
             raise OSError(f"a view cannot be served at {host}, port {port}: {wrong}") from None
         host_in_url = f"[{host}]" if ":" in host else host
         query = f"?token={self.token}" if self.token else ""
@@ -255,12 +257,14 @@ class _PageServer:
         """Return the reason to refuse a request as text, or "" to answer it. With a token, the
         request must have it. Without a token, the request must come from this machine and from the
         server's own page, since web pages of other sites could send requests too."""
-        name = request.host.rsplit(":", 1)[0].strip("[]")
+        # Without the port, and without the brackets of an IPv6 address.
+        host_name = request.host.rsplit(":", 1)[0].strip("[]")
         if self.token:
             token = request.query.get("token", "")
+            # The comparison takes the same time wherever the first difference is.
             is_right = secrets.compare_digest(token.encode("utf-8", "replace"), self.token.encode())
             return "" if is_right else "the token is wrong"
-        if name not in _LOCAL:
+        if host_name not in _LOCAL:
             return "this view is for its own machine alone"
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"http://{request.host}":
@@ -312,7 +316,7 @@ class _PageServer:
                 except RequestError as wrong:
                     await _send(socket, {"id": None, "error": str(wrong)})
                     continue
-                if question is None:
+                if question is None:  # another question was cancelled
                     continue
                 # Too many questions at once are refused, so that a page cannot fill the memory.
                 if len(waiting) >= _WAITING:

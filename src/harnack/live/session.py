@@ -119,6 +119,7 @@ class MessageHandler:
         if question.get("kind") == "cancel" and type(question.get("which")) is int:
             self._cancelled.add(question["which"])
             return None
+        # An answer with a picture has four bytes for it.
         number = question.get("id")
         if type(number) is not int or not 0 <= number < 2**32:
             raise RequestError("id must be a whole number, by which the answer is known")
@@ -275,6 +276,8 @@ class Session:
         surfaces = [
             surface_of_scene.surface for surface_of_scene in self.live.surfaces_at(controls)
         ]
+        # A `TracedSurface` consists of a `Surface` and of options of traces. All arrays of a result
+        # have one entry, as there is one ray.
         results = [
             trace(surface_of_scene.surface, origin, direction, options=surface_of_scene.options)
             for surface_of_scene in surfaces
@@ -336,6 +339,7 @@ class Session:
         if not isinstance(eye, dict):
             raise RequestError("eye must be an object of origin, right, up, forward and pixel")
         axes = cast("JsonDict", eye)
+        # `_points` makes an array (1, 3) of a list with one point.
         origin, right, up, forward = (
             _points([axes.get(name)], f"eye: {name}")[0]
             for name in ("origin", "right", "up", "forward")
@@ -438,6 +442,7 @@ def parse_camera(camera: Any) -> tuple[FloatArray, FloatArray, float]:
     if not isinstance(camera, dict):
         raise RequestError("camera must be an object of position, target and fov")
     pose = cast("JsonDict", camera)
+    # `_points` makes an array (1, 3) of a list with one point.
     eye, target = (
         _points([pose.get(name)], f"camera: {name}")[0] for name in ("position", "target")
     )
@@ -474,6 +479,7 @@ def _volume(cut: Any) -> Volume | None:
     """
     if cut is None:
         return None
+    # How many numbers each kind has.
     kinds = {"ball": 4, "box": 6, "plane": 4}
     data = cast("JsonDict", cut) if isinstance(cut, dict) else {}
     if len(data) != 1 or not set(data) <= set(kinds):

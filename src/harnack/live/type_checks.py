@@ -67,6 +67,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is tuple or (isinstance(origin, type) and issubclass(origin, Iterable)):
         is_list = isinstance(value, tuple)
         return is_list and all(_fits(part, arguments[0]) for part in cast("tuple[Any, ...]", value))
+    # Annotations of other kinds are not checked.
     return not isinstance(hint, type) or isinstance(value, hint)
 
 

@@ -186,9 +186,11 @@ def _job(
     shared: further shared arguments.
     """
     first = frames[0]
-    # Arguments are compared by identity: equal arrays or fields could be expensive to compare.
+    # Arguments are compared by identity: comparing the contents of arrays or fields could take
+    # long.
     varying = [name for name in first if any(frame[name] is not first[name] for frame in frames)]
     shared = {**shared, **{name: first[name] for name in first if name not in varying}}
+    # `register` returns the Mitsuba module, whose variant is the one that is set now.
     return _FilmJob(shared, register().variant()), [
         ({name: frame[name] for name in varying},) for frame in frames
     ]
@@ -253,9 +255,9 @@ def _cameras(
     boxes = [np.array(camera.box.bounds()) for camera in cameras if camera.box is not None]
     # Tracing rays for visible points is needed only without boxes.
     points = np.concatenate(boxes or [_points(moments, steps)])
-    # The box of all that has to be in view; if boxes were given, its corners.
+    # The lower and the upper corner of the box of all that has to be in view.
     corners = np.array([points.min(axis=0), points.max(axis=0)])
-    if boxes:
+    if boxes:  # then all eight corners of this box are framed
         points = np.array(np.meshgrid(*corners.T)).reshape(3, -1).T
     box, center = Box(*map(_as_point, corners)), _as_point(corners.mean(axis=0))
     framed = [
@@ -385,6 +387,7 @@ def _gif(path: Path, fps: float) -> Generator[Callable[[Pixels], None]]:
     # Milliseconds: GIF files count hundredths of a second, and players slow down what is faster
     # than 50 pictures a second.
     duration = 10 * max(2, round(100 / fps))
+    # loop=0: repeated for ever; disposal=2: each picture is cleared before the next one.
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, disposal=2
     )
@@ -401,9 +404,10 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
     if min(size) < 2:
         raise ValueError(f"a film in .mp4 has sides of at least 2 pixels, not {size}")
     with av.open(str(path), "w") as container:
+        # Denominators up to 1001 express the rates of television, such as 30000/1001.
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "16"}
+        stream.options = {"crf": "16"}  # high quality: 0 is lossless, and 23 the default
 
         def add(pixels: Pixels) -> None:
             """Add a picture (h, w, 3) to the film.
@@ -413,6 +417,7 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             """
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
+            # `stream` is the video in the file `container`.
             height, width = (side - side % 2 for side in pixels.shape[:2])
             # The size is set by the first picture, which a color bar may have widened.
             if not stream.codec_context.is_open:
@@ -424,4 +429,5 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             container.mux(stream.encode(frame))
 
         yield add
+        # Without a picture, `encode` returns what the encoder still holds back.
         container.mux(stream.encode())

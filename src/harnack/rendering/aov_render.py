@@ -196,9 +196,11 @@ class AovTask:
         """
         mi, count = self.mi, dr.width(pixel)
         position = film_positions(mi, pixel, offset, self.size)
+        # One fixed wavelength and the middle of the lens: no random numbers are needed.
         ray, _ = self.sensor.sample_ray_differential(
             self.sensor.shutter_open(), 0.5, position, mi.Point2f(0.5)
         )
+        # An interaction that is not valid: the rays start at the camera, not on a surface.
         camera = dr.zeros(mi.SurfaceInteraction3f)
         si, first = self.world.intersect(mi.Ray3f(ray), camera, mi.Bool(True))
         # Isolines are looked for only in pictures of values: other pictures do not show them.
@@ -428,7 +430,7 @@ def aov_picture(
     """
     mode = AOV_MODES[show]
     scale = None if mode.scale is None else mode.scale(view)
-    if scale is None:
+    if scale is None:  # normals and status have colors of their own
         return mode.picture(view, None)
     if value_range is not None:
         # A range that is given is not cyclic, even for angles.
@@ -446,6 +448,7 @@ def aov_picture(
     numbers = np.asarray(mode.numbers(view), dtype=np.float64)
     if show != "evaluations":  # rays that miss have evaluations, but none of the other numbers
         numbers = numbers[view.status == int(RayStatus.HIT)]
+    # The bar gets a pointed end where the picture has numbers beyond its range.
     scale = scale.with_exceeded(numbers[np.isfinite(numbers)])
     return add_color_bar(picture, scale, view.background)
 

@@ -155,10 +155,12 @@ class Camera:
         """
         if self.position is None and self.target is None and self.distance is None:
             origin, target = self.frame_points(points, size)
+            # The second of the axes is up, and the azimuth comes before the elevation.
             return CameraPose(
                 origin, target, self.axes()[1], self.fov_or_default, self.azimuth_elevation[0]
             )
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        # `to_world` maps arrays of points: here of one point.
         target = middle if self.target is None else to_world(np.array([self.target]))[0]
         if self.position is not None:
             origin = to_world(np.array([self.position]))[0]

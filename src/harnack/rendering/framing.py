@@ -53,6 +53,7 @@ def rotation_to_z_up(up: Any) -> FloatArray:
                 f"{did_you_mean(up, UP_AXES)}"
             )
         axis = up.removeprefix("-")
+        # About the x axis.
         half_turn = np.diag([1.0, -1.0, -1.0]) if up.startswith("-") else np.eye(3)
         return half_turn @ _UPRIGHT[axis]
     vector = np.array(as_point(up, "up"))
@@ -61,13 +62,14 @@ def rotation_to_z_up(up: Any) -> FloatArray:
     # Dividing by the largest coordinate first avoids overflow in the norm.
     vector, z = vector / float(np.abs(vector).max()), np.array([0.0, 0.0, 1.0])
     vector = vector / float(np.linalg.norm(vector))
-    # The shortest rotation is about the axis at right angles to both.
+    # The shortest rotation is about the axis at right angles to both. There is none if the vector
+    # is z or -z.
     normal = np.cross(vector, z)
     if float(np.linalg.norm(normal)) < 1e-12:
         return rotation_to_z_up("z" if vector[2] > 0 else "-z")
     axis_of_rotation = normal / np.linalg.norm(normal)
-    # Two orthonormal frames with the same axis u, one that contains the vector and one that
-    # contains z. The rotation maps one frame to the other.
+    # Two orthonormal frames, as rows, that begin with this axis; one ends with the vector, and one
+    # with z. The rotation maps the first frame to the second.
     vector_frame, z_frame = (
         np.stack([axis_of_rotation, np.cross(vector, axis_of_rotation), vector]),
         np.stack([axis_of_rotation, np.cross(z, axis_of_rotation), z]),
@@ -117,6 +119,7 @@ def _unbounded(surface: TracedSurface) -> UnboundedSurfaceError:
     levels = surface.level_values
     levels_text = ", ".join(f"{level:g}" for level in levels)
     reason = f"the surface of level {levels_text} reaches to infinity, as far as is known"
+    # The remainder is the distance from the nearest multiple of the period.
     if field.period is not None and any(
         abs(math.remainder(level, field.period)) < 1e-6 * field.period for level in levels
     ):
@@ -229,6 +232,7 @@ def _find_visible_points(surface: TracedSurface, backend: Backend, ends: FloatAr
                 "nothing is to be seen of this surface: its domain, clip and section do not "
                 "overlap, so that nothing is left to draw"
             )
+        # A surface that is too far from the origin has an error of its own.
         check_offset(ends)
         raise NothingVisibleError(
             "nothing is to be seen of this surface: no ray of a grid on the sides of its box "

@@ -114,10 +114,10 @@ class HybridScene:
         """
         return cls(mi, scene, tuple(s for s in scene.shapes() if is_proxy(s)), queued)
 
-    def _placed(self, carrier: Any) -> PlacedSurface:
+    def _placed(self, proxy: Any) -> PlacedSurface:
         """Return the level set of a proxy, placed in the world. It is traced with a queue of rays
         if the scene is."""
-        return carrier.placed.queued() if self.queued else carrier.placed
+        return proxy.placed.queued() if self.queued else proxy.placed
 
     def intersect(
         self, ray: Any, start: Any, active: Mask, hidden: Mask | None = None
@@ -182,6 +182,7 @@ class HybridScene:
             """Return the mask of hits with a shape that emits light."""
             return active & hit.is_valid() & hit.shape.is_emitter()
 
+        # The state of the loop is the current hit, and the mask of rays that go on.
         def skip(hit: Any, active: Mask) -> tuple[Any, Mask]:
             """Find the next hit of each active ray, behind the shape that it has hit. Returns the
             hits, and the mask of those that are again with a shape that emits light."""

@@ -154,8 +154,8 @@ class _Vertex:
     def none(cls, mi: Any) -> _Vertex:
         """Return the vertex of paths that have none yet, as they come from the camera. It is not
         valid."""
-        zero = dr.zeros(mi.SurfaceInteraction3f)
-        return cls(zero.p, zero.n, zero.shape, mi.Bool(False))
+        zeros = dr.zeros(mi.SurfaceInteraction3f)
+        return cls(zeros.p, zeros.n, zeros.shape, mi.Bool(False))
 
     @classmethod
     def of(cls, si: Any) -> _Vertex:
@@ -233,6 +233,7 @@ class DenoisingFeatures:
         without a smooth BSDF, such as clear glass, count as white.
         """
         bsdf, along_normal = si.bsdf(), mi.SurfaceInteraction3f(si)
+        # The same interaction, but seen along the normal, from the same side.
         along_normal.wi = mi.Vector3f(0, 0, dr.mulsign(mi.Float(1), si.wi.z))
         albedo = bsdf.eval_diffuse_reflectance(along_normal, active)
         # Mirrors may give more than 1 straight on: they are darkened, and keep their hue.
@@ -482,16 +483,19 @@ class PathTracer:
         mi, bsdf = self.mi, si.bsdf()
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         # False: whether the emitter is visible is not tested here.
-        light, weight = world.scene.sample_emitter_direction(
+        to_light, radiance = world.scene.sample_emitter_direction(
             si, vertex_sampler.next_2d(), False, active
         )
-        active &= light.pdf > 0
-        scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+        # The radiance comes divided by the density with which its direction was sampled.
+        active &= to_light.pdf > 0
+        scattered, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(to_light.d), active)
         active &= dr.max(scattered) > 0
         # A BSDF cannot find a light that is a point: its weight is 1.
-        mis_weight = dr.select(light.delta, 1, _power_heuristic(light.pdf, pdf))
-        sent = self._clamped(paths.throughput * scattered * weight * mis_weight, paths.is_diffused)
-        return _LightConnection(spawn_ray_to(mi, si, clearance, light.p), sent, active)
+        mis_weight = dr.select(to_light.delta, 1, _power_heuristic(to_light.pdf, pdf))
+        sent = self._clamped(
+            paths.throughput * scattered * radiance * mis_weight, paths.is_diffused
+        )
+        return _LightConnection(spawn_ray_to(mi, si, clearance, to_light.p), sent, active)
 
 
 def _power_heuristic(a: Real, b: Real) -> Real:

@@ -62,7 +62,7 @@ def as_field(function: Any, name: str = "color_by") -> Field:
     if isinstance(function, str):
         try:
             return expression(function)
-        except ValueError as error:
+        except ValueError as error:  # the name may end with a comma, which suits other messages
             raise ValueError(f"{name.rstrip(',')}: {error}") from None
     if isinstance(function, Field):
         if function.patches is not None:
@@ -149,7 +149,7 @@ class Isolines:
             )
         for name, number in values.items():
             object.__setattr__(self, name, number)
-        self._exact_interval()
+        self._exact_interval()  # raises the error of an interval that does not divide the period
 
     def _exact_interval(self) -> float | None:
         """Return the difference of neighboring levels; None if the levels are listed. For a
@@ -214,6 +214,7 @@ def _numbers(levels: Any) -> tuple[float, ...]:
         TypeError, ValueError: anything else.
     """
     try:
+        # A text is refused, also one that NumPy would read, such as "1": "none" is no number.
         numbers = np.atleast_1d(np.asarray("none" if isinstance(levels, str) else levels, float))
     except (TypeError, ValueError):
         raise TypeError(f"levels of isolines must be numbers, not {levels!r}") from None

@@ -129,6 +129,7 @@ def render_paths(
     executor = Executor(task) if executor is None else executor
     width, height = task.size
     features = task.features
+    # The columns are those of `render_range`: radiance, covered fraction, albedo and normal.
     image = np.empty((width * height, 10 if features else 4), dtype=np.float32)
     lost = 0
     ranges = executor.split_range(width * height, max(1, task.paths_a_band // task.spp))
@@ -215,6 +216,7 @@ def as_rgb(mi: Any, radiance: Any, wavelengths: Any) -> Any:
     if mi.is_spectral:
         color_matching = [mi.cie1931_xyz(wavelength) for wavelength in wavelengths]
         xyz = sum(value * weights for value, weights in zip(radiance, color_matching, strict=True))
+        # The mean over the wavelengths, scaled such that white has Y = 1.
         return mi.xyz_to_srgb(xyz * (mi.MI_CIE_Y_NORMALIZATION / len(color_matching)))
     return mi.Color3f(radiance[0]) if mi.is_monochromatic else mi.Color3f(radiance)
 
@@ -281,17 +283,17 @@ def estimate_time(
     not measured, and its estimate is 0.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    pixels = width * height
-    path_count = pixels * spp
+    pixel_count = width * height
+    path_count = pixel_count * spp
 
     def seconds(count: int) -> float:
         """Return the time of a run of `count` paths."""
         # The golden ratio spreads any number of pixels evenly.
-        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixels).astype(np.int64)
-        pixel = upload_indices(mi, np.minimum(indices, pixels - 1))
+        indices = (np.arange(count) * 0.6180339887498949 % 1 * pixel_count).astype(np.int64)
+        pixel = upload_indices(mi, np.minimum(indices, pixel_count - 1))
         sample = dr.opaque(mi.UInt32, 0, count)
         began = time.perf_counter()
-        # One path in each of these pixels.
+        # One path in each of these pixels, with 0 as the seed.
         results, _ = trace_samples(mi, scene, sensor, tracer, pixel, sample, 0, features)
         dr.eval(results.light)
         dr.sync_thread()
@@ -402,10 +404,11 @@ class RefractionTracer:
         self, world: HybridScene, light: StudioLight, *, hides_lights: bool = False
     ) -> None:
         self.world, self.light = world, light
+        # The mask of rays that do not see lights: all of them, or none.
         self.hidden = world.mi.Bool(True) if hides_lights else None
         mi = world.mi
-        pairs = ((carrier, refractive_index(mi, carrier)) for carrier in world.proxies)
-        self.indices = tuple((carrier, index) for carrier, index in pairs if index is not None)
+        pairs = ((proxy, refractive_index(mi, proxy)) for proxy in world.proxies)
+        self.indices = tuple((proxy, index) for proxy, index in pairs if index is not None)
 
     def trace(self, ray: Any) -> RefractedHits:
         """Find the first opaque hits of camera rays, behind transparent solids. Returns
@@ -444,6 +447,7 @@ class RefractionTracer:
         a transparent solid is refracted there and goes on; any other ray ends. A ray also ends
         where it hits an isoline, and at the 33rd boundary."""
         mi, world, d = self.world.mi, self.world, hits.ray.d
+        # The segment starts at the hit of the last one.
         si, first = world.intersect(hits.ray, hits.si, hits.active, self.hidden)
         throughput = hits.throughput * transmittance(mi, world.proxies, hits.si, si, d)
         interface_count = hits.interface_count + 1
@@ -495,8 +499,8 @@ class RefractionTracer:
         mirrored = d - 2 * dr.dot(normal, d) * normal
         reflectance_straight_on = dr.square((index - 1) / (index + 1))
         black, one = dr.zeros(mi.Color3f), mi.Float(1)
-        # Without diffuse color, only the highlight remains. It is scaled from the usual
-        # reflectance.
+        # Of a glossy black surface that nothing hides, only the highlight remains. It is scaled
+        # from the usual reflectance.
         gloss = self.light.shade(black, normal, -d, mi.Bool(True), one) * (
             reflectance_straight_on / _DEFAULT_REFLECTANCE
         )

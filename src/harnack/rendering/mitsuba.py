@@ -182,6 +182,7 @@ def _scene_text(path: Path) -> str:
         ),
         b"",
     )
+    # Without a mark the encoding does not matter: markup is ASCII, and latin-1 reads all bytes.
     text = data.decode(_BYTE_ORDER_MARKS.get(byte_order_mark, "latin-1"), "replace")
     if not text.lstrip("\ufeff \t\r\n").startswith("<"):
         raise FileLocation(path).error("this is no XML file: it does not begin with '<'")
@@ -195,6 +196,7 @@ def _scene_text(path: Path) -> str:
 def _files_named(text: str) -> list[tuple[str, str]]:
     """Find the files that the text of a scene may name. Returns pairs (element, name), such as
     ("include", "lights.xml")."""
+    # Groups 2 and 3 are the value in double and in single quotes; one of them is None.
     return [
         (element[1], attribute[2] or attribute[3])
         for element in _NAMES_A_FILE.finditer(text)
@@ -322,7 +324,7 @@ def refract(normal: Any, d: Any, index: Any) -> tuple[Any, Any]:
     is_refracted = refracted_cosine > 0
     refracted_cosine = dr.sqrt(dr.maximum(refracted_cosine, 0))
     # Fresnel's amplitudes for light that is polarized perpendicular and parallel to the plane of
-    # incidence.
+    # incidence. The divisors are kept above 0.
     perpendicular = (eta * cosine - refracted_cosine) / dr.maximum(
         eta * cosine + refracted_cosine, 1e-9
     )

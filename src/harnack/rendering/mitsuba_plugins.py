@@ -155,7 +155,7 @@ def _with_settings(mi: Any, integrator: Any) -> PathTracer:
     integrators. They can only be read from the integrator's text."""
     words = str(integrator)
     depths = {name: int(n) for name, n in re.findall(r"(max_depth|rr_depth) = (\d+)", words)}
-    # A limit of 2^31 or more, or none, means no limit.
+    # A limit of 2^31 or more, or none, means no limit, which is -1 here.
     depth = depths.get("max_depth", 2**32 - 1)
     return PathTracer(
         mi, -1 if depth >= 2**31 else depth, depths["rr_depth"], bool(integrator.hide_emitters)
@@ -218,6 +218,7 @@ def surface_from_properties(props: Any) -> TracedSurface:
     for name in ("level", "tolerance", "max_steps", "require_crossing"):
         if name in props:
             keywords[name] = props[name]
+    # The verb is the subject of messages of errors.
     surface = traced_surface(_field(props), verb="a shape", **keywords)
     check_has_inside(surface)
     return surface
@@ -312,6 +313,7 @@ def mitsuba_shape(
             raise TypeError(
                 "a shape takes bsdf=..., not material=...: that is an option of harnack.render"
             )
+        # The verb is the subject of messages of errors.
         surface = traced_surface(surface, options, verb="a shape", **keywords)
     check_has_inside(surface)
     surface = surface.with_call_cache()

@@ -219,6 +219,7 @@ def _carrier_class(variant: str) -> Any:
             cut_bsdf: Any, isolines: Sequence[Isolines],
         ) -> None:  # fmt: skip
             ends = bounding_box(surface)
+            # With two vertices and two faces.
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)
             self.surface = surface
             self.placement = placement

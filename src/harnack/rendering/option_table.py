@@ -387,6 +387,7 @@ def shows_options(verb: str) -> Callable[[_Function], _Function]:
             option.name,
             kind,
             default=option.default_in(verb),
+            # Annotations of a TypedDict are forward references, which hold the type as a text.
             annotation=getattr(annotations.get(option.name), "__forward_arg__", "Any"),
         )
         for option in options_of(verb)

@@ -348,6 +348,7 @@ def _composite_over_backdrop(
         return image, tone_map(image)
     if stage.backdrop is None:
         return image, tone_map(image)
+    # The light is that of the whole pixel: what is not covered adds no light to it.
     light, uncovered = image[..., :3], 1 - image[..., 3:]
     if isinstance(stage.backdrop, GroundBackdrop):
         image = light + uncovered * studio_wall(mi, sensor, stage.backdrop, stage.azimuth, show)

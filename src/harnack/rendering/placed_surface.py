@@ -257,7 +257,7 @@ class PlacedSurface:
         cones = PixelCones(
             self.prepared, o, d, self.prepared.backend.Float(radius), bounding_balls, solid_range
         )
-        # The second result, the number of evaluations, is not needed.
+        # True: all cones are active. The second result, the number of evaluations, is not needed.
         return cones.partially_covered(t_max, True)[0]
 
     def _local_ray(self, o: Vec3, d: Vec3, t_max: Real) -> tuple[Vec3, Vec3, Real]:

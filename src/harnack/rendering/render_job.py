@@ -111,6 +111,7 @@ class RenderJob:
         if options.show in AOV_MODES:
             placement = Placement.identity() if stage is None else stage.placement
             aov_task = AovTask.of(mi, scene, sensor, placement, options.color_by)
+            # Of pictures of numbers, the bottom and the top of the backdrop have the same color.
             if isinstance(options.backdrop, GradientBackdrop):
                 aov_task = replace(aov_task, background=options.backdrop.bottom)
             return aov_task
@@ -129,6 +130,7 @@ class RenderJob:
         spp = options.spp or check_spp(
             int(sensor.sampler().sample_count()), source=", which the scene's sampler asks for"
         )
+        # The denoiser needs the features, albedo and normal, at first hits.
         return PathRenderTask(mi, scene, sensor, tracer, spp, options.seed, options.denoise)
 
     def _task_in_variant(self) -> Any:

@@ -144,7 +144,7 @@ def check_color_bar(color_bar: Any, show: str) -> bool | str:
     if isinstance(color_bar, str):
         if not color_bar.isprintable():
             raise ValueError(f"the title of a color bar is one line of letters, not {color_bar!r}")
-        typeface_for(color_bar, 10)
+        typeface_for(color_bar, 10)  # raises the error of letters that cannot be written
     return color_bar
 
 
@@ -158,6 +158,7 @@ def check_backdrop(backdrop: Any, show: str) -> Backdrop:
     if backdrop is None:
         return GroundBackdrop("light")
     behind = parse_backdrop(backdrop)
+    # In place of a ground, pictures of numbers have its color at the bottom and at the top.
     if show in AOV_MODES and isinstance(behind, GroundBackdrop):
         return GradientBackdrop(*(AOV_BACKGROUNDS[behind.name],) * 2)
     if show in AOV_MODES and not (
@@ -303,6 +304,7 @@ def check_camera(camera: Any) -> Camera:
     if isinstance(camera, Camera):
         return camera
     try:
+        # The letters of a text such as "123" are no coordinates: () has the wrong length.
         x, y, z = (float(c) for c in (() if isinstance(camera, str) else camera))
     except (TypeError, ValueError):
         raise TypeError(

@@ -103,6 +103,7 @@ def _from_text(text: str, name: str) -> Color:
             raise ValueError(
                 f"{name} must be {_COLOR_HELP}, not {text!r}{did_you_mean(text, NAMED_COLORS)}"
             )
+        # "#rgb" stands for "#rrggbb".
         digits = match[1] if len(match[1]) == 6 else "".join(2 * digit for digit in match[1])
     red, green, blue = (int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4))
     return red, green, blue
@@ -262,6 +263,7 @@ class ColorScale:
             first_multiple, last_multiple = self._multiples(spacing)
         if last_multiple - first_multiple < 1:  # no room for two nice numbers
             largest = max(abs(self.low), abs(self.high))
+            # At least two digits more than the two ends have in common.
             digits = 2 + max(2, math.ceil(math.log10(largest / (self.high - self.low))))
             return [(end, f"{end:.{digits}g}") for end in (self.low, self.high)]
         largest = max(abs(first_multiple), abs(last_multiple)) * spacing
@@ -306,6 +308,7 @@ def _ticks_at_parts_of_pi(multiple: int, max_count: int) -> list[tuple[float, st
     """Choose ticks for a cyclic scale from 0 to `multiple` times pi. Returns pairs (number, text)
     at multiples of pi/2, pi, 2 pi, ...: at the closest spacing with at most `max_count` ticks, but
     at least two."""
+    # In units of pi/2; the last one is that of the largest multiple, `_MAX_PI_MULTIPLE`.
     spacing_in_halves = next(
         step for step in (1, 2, 4, 8, 16, 32)
         if (2 * multiple) // step + 1 <= max(max_count, 2) or step >= 2 * multiple
@@ -394,6 +397,7 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
     font = typeface_for(scale.name, letter_height)
     bar_length = max(2, min(round(_BAR_HEIGHT * height), height - 4 * letter_height))
     bar_width, gap = max(3, round(_BAR_WIDTH * height)), max(2, letter_height // 2)
+    # Ticks are two heights of letters apart, but at least two are asked for.
     ticks = scale.ticks(max(2, min(6, bar_length // (2 * letter_height))))
     tick_width = max(font.getlength(text) for _, text in ticks)
     width = max(bar_width + gap + tick_width, font.getlength(scale.name))

@@ -63,7 +63,7 @@ class ConeCoverage:
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
         self.mi = mi
-        self.placed = tuple(_prepared(mi, carrier) for carrier in world.proxies)
+        self.placed = tuple(_prepared(mi, proxy) for proxy in world.proxies)
 
     def partly_covered(self, ray: Any, position: Any) -> Any:
         """Return the mask of pixels whose cones a surface covers in part, in front of the points
@@ -88,7 +88,7 @@ class ConeCoverage:
         return is_covered
 
 
-def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
+def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
     """Prepare the surface of a proxy (the mesh that stands for it in Mitsuba) for cones. Returns
     the surface with a tracer of its own, and a ball inside its extent and a ball around its extent,
     as `inner_and_outer_ball` returns them.
@@ -96,7 +96,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
     Raises:
         ValueError: the surface consists of level sets of several functions, or its field jumps.
     """
-    surface, backend = carrier.surface, mitsuba_backend(mi)
+    surface, backend = proxy.surface, mitsuba_backend(mi)
     if surface.field.patches is not None:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
@@ -108,7 +108,7 @@ def _prepared(mi: Any, carrier: Any) -> tuple[PlacedSurface, Any]:
             'values tell no distance. Leave antialias at "edges"'
         )
     # Cones need a tracer that finds where f crosses the level.
-    placed = replace(carrier.placed, prepared=surface.prepare(backend, crosses=True))
+    placed = replace(proxy.placed, prepared=surface.prepare(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 
 
@@ -174,7 +174,7 @@ def ambient_visibility(
         distance; 0 if nothing is seen there."""
         # Points are denser near the pixel: their distances grow quadratically.
         distance = 1.0 + reach_in_pixels * ((k + 0.5) / SKY_SAMPLES) ** 2
-        # The pixel nearest to this point of the picture.
+        # The pixel nearest to this point of the picture. (x, y) is the pixel of the lane.
         u, v = x + distance * direction.x, y + distance * direction.y
         is_in_picture = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
         pixel = mi.UInt32(dr.round(v)) * columns + mi.UInt32(dr.round(u))
@@ -330,7 +330,7 @@ class ShadedTask:
         pixel = upload_indices(mi, self.order[start:stop])
         gbuffer = self._trace_pixels(pixel, mi.Vector2f(_MIDDLE))
         dr.eval(gbuffer)
-        if self.finder is not None:
+        if self.finder is not None:  # a `ConeCoverage`, if cones are requested
             ray, _ = self.ray(pixel, mi.Vector2f(_MIDDLE))
             gbuffer.needs_refinement |= self.finder.partly_covered(ray, gbuffer.position)
             dr.eval(gbuffer)
@@ -348,6 +348,7 @@ class ShadedTask:
         """
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
+        # The first opaque hits, behind transparent solids (`RefractedHits`).
         hits = self.evaluate_with.trace(mi.Ray3f(ray))
         si, first = hits.si, hits.first
         # Adding zeros gives the mask its full width.
@@ -425,11 +426,11 @@ class ShadedTask:
         """Return the mask of interactions with a level set that bounds no solid, so that both of
         its sides can be seen."""
         is_open = self.mi.Bool(False)
-        for carrier in self.world.proxies:
-            surface = carrier.surface
+        for proxy in self.world.proxies:
+            surface = proxy.surface
             # The zero level set of a field of the class `Solid` bounds a solid, too.
             if surface.solid_range is None and not isinstance(surface.field, Solid):
-                is_open |= si.shape == self.mi.ShapePtr(carrier)
+                is_open |= si.shape == self.mi.ShapePtr(proxy)
         return is_open
 
     def shade(self, buffer: GBuffer, sky: Any) -> Any:
@@ -459,6 +460,7 @@ class ShadedTask:
         position, sky: (n, 5, 3) and (n, 5), the points seen by each pixel and its four neighbors,
             and the fractions of the hemisphere there that nothing hides (`neighborhood`).
         """
+        # `offsets` are the samples of a pixel besides its middle.
         mi, spp = self.mi, len(self.offsets)
         # Successive lanes are the samples of one pixel, then those of the next.
         sample = dr.arange(mi.UInt32, len(indices) * spp)
@@ -477,8 +479,9 @@ class ShadedTask:
 
     def neighborhood(self, indices: IntArray, *arrays: Any) -> tuple[npt.NDArray[Any], ...]:
         """Gather the entries of arrays at n pixels and their four neighbors. Returns an array (n,
-        5, ...) for each given array. At the picture's border, a pixel takes the place of a missing
-        neighbor.
+        5, ...) for each given array: the entry of the pixel itself, then those of its neighbors to
+        the right, to the left, below and above. Beyond the picture's border there is no neighbor,
+        and the entry of the pixel itself stands in its place.
 
         indices: (n,) the pixels, counted by rows.
         arrays: Dr.Jit arrays with an entry for each pixel of the picture, counted by rows.
@@ -535,7 +538,7 @@ def render_shaded(
     ):
         dr.scatter(gbuffer, buffer, upload_indices(mi, order[start:stop]))
         dr.eval(gbuffer)
-        dr.sync_thread()
+        dr.sync_thread()  # kernels run asynchronously: only finished work is reported
         advance(_FIRST_PASS_FRACTION * (stop - start) / count)
     # All first hits are needed before the first pixel can be lit.
     sky = ambient_visibility(mi, gbuffer.position, gbuffer.normal, gbuffer.width, size)

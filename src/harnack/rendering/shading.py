@@ -50,6 +50,7 @@ def tiled_pixel_order(size: tuple[int, int]) -> IntArray:
     length.
     """
     width, height = size
+    # The numbers of squares down and across, rounded up.
     rows, columns = -(-height // _TILE), -(-width // _TILE)
     y, x = np.indices((rows * _TILE, columns * _TILE))
     # Squares may go beyond the right and lower border; such places hold -1 and are left out.
@@ -232,7 +233,7 @@ def two_sided_color(color: Any, other: Any, inside: Any) -> Any:
     color, other: the colors of the visible and of the hidden side.
     inside: mask of points that are seen from the side of larger values.
     """
-    is_one_color = dr.max(dr.abs(color - other)) < 1e-4
+    is_one_color = dr.max(dr.abs(color - other)) < 1e-4  # equal up to rounding
     return dr.select(inside & is_one_color, color * _like(color, _INNER_TINT), color)
 
 
@@ -242,6 +243,7 @@ def hole_filling_tint(color: Any, is_filling: Any) -> Any:
 
     is_filling: mask of such points.
     """
+    # In a warm color, red is much stronger than blue.
     tint = dr.select(color[0] > 1.6 * color[2], _like(color, _TEAL), _like(color, _AMBER))
     return dr.select(is_filling, dr.lerp(color, tint, _FILLING_TINT), color)
 
@@ -394,7 +396,8 @@ def _key_directions(key: Any) -> FloatArray:
 def sky_directions() -> FloatArray:
     """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
     of their angle to the vertical."""
-    # Uniform squares of the sine give the cosine distribution.
+    # Uniform squares of the sine give the cosine distribution. The height is kept above 0, so that
+    # no ray runs along the floor.
     sine_squared, angle = np.moveaxis(_square(), -1, 0)
     sine = np.sqrt(sine_squared)
     return np.stack([sine * np.cos(2 * math.pi * angle), sine * np.sin(2 * math.pi * angle),
@@ -451,6 +454,7 @@ def studio_wall(
     width, height = (int(n) for n in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
     position = film_positions(mi, pixel, mi.Vector2f(0.5), (width, height))
+    # One fixed wavelength and the middle of the lens: no random numbers are needed.
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, position, mi.Point2f(0.5))
     # From 0 at the horizon to 1 straight above.
     height_of_ray = np.clip(to_numpy(ray.d)[:, 2], 0, 1)
@@ -467,6 +471,7 @@ def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)
+    # Not glossy, so that the direction to the eye does not matter; and nothing hides the sky.
     lit = StudioLight.of(matrix).shade(color, up, up, mi.Bool(False), one)
     return to_numpy(lit).reshape(3).astype(np.float64)
 
@@ -479,6 +484,7 @@ def backdrop_image(
     if isinstance(backdrop, ImageBackdrop):
         return _covering(mi, backdrop.pixels, size)
     width, height = size
+    # One row for all, (1, 1, 3), or one color for each row, (h, 1, 3).
     if backdrop.bottom == backdrop.top:
         rows = np.array([[linear_from_srgb(backdrop.top)]], dtype=np.float32)
     else:  # even steps in sRGB look even
@@ -505,5 +511,6 @@ def _covering(mi: Any, image: FloatImage, size: tuple[int, int]) -> FloatImage:
     cropped = np.ascontiguousarray(image[top : top + rows, left : left + columns])
     if (columns, rows) == size:
         return cropped
+    # The filter overshoots at edges: negative light is clamped.
     bitmap = mi.Bitmap(cropped).resample(mi.ScalarVector2u(*size), clamp=(0.0, np.inf))
     return np.array(bitmap, dtype=np.float32)

@@ -54,6 +54,7 @@ def _coated(color: Color, roughness: float) -> Dictionary:
         "type": "roughplastic",
         "diffuse_reflectance": _rgb(color),
         "alpha": roughness,
+        # Light that is reflected to and fro under the coat takes on more of the base's color.
         "nonlinear": True,
     }
 
@@ -105,7 +106,7 @@ class Material:
             ValueError: the material is transparent, and the surface is open.
         """
         front, back = self.front, self.back
-        if not traced_light:
+        if not traced_light:  # a missing back stays None
             front, back = _without_table(front), back and _without_table(back)
         if solid:
             return front
@@ -347,6 +348,7 @@ def stage_placement(points: FloatArray, turned: FloatArray | None = None) -> Pla
     turned = np.eye(3) if turned is None else turned
     points = points @ turned.T
     lower, upper = points.min(axis=0), points.max(axis=0)
+    # The points may all be the same.
     scale = 2.0 / max(float(np.linalg.norm(upper - lower)), 1e-30)
     # The middle of the box's base is placed at the origin of the world.
     base_point = np.array([*(lower + upper)[:2] / 2, lower[2]])
@@ -375,7 +377,7 @@ def _sensor(mi: Any, pose: CameraPose, size: tuple[int, int]) -> dict[str, Any]:
         "fov": pose.fov,
         "fov_axis": "larger",
         # Rays begin one to two steps before the stage, at a whole multiple of a step, since the
-        # distance is a literal of kernels.
+        # distance is a literal of kernels. It must be positive.
         "near_clip": max(1e-3, _NEAR_CLIP_STEP * (distance // _NEAR_CLIP_STEP - 1)),
         "far_clip": _FAR_CLIP,
         "to_world": to_world,

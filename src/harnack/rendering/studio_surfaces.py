@@ -49,6 +49,7 @@ def drawn_surfaces(
     thickness: if not None, closed walls of this thickness are drawn in place of the surfaces.
     shorthand: options of `Surface` and `TraceOptions` as keywords.
     """
+    # Only the surfaces are used here, so the material (None, the default) does not matter.
     drawn = studio_objects(
         surfaces, None, options, shorthand, boundary_radius=boundary_radius, thickness=thickness
     )
@@ -279,9 +280,10 @@ def _surface(
     # Such a surface has all of its options already.
     if isinstance(element, TracedSurface):
         return element.with_call_cache(begins=True)
-    # In the call's cache, the field is prepared only once.
+    # All options of surfaces and of traces that `render` has.
     honored = names_of("render", "surface", "trace")
     target, choices = surface_and_options("render", element, options, shorthand, honored)
+    # In the call's cache, the field is prepared only once.
     surface = TracedSurface.of(target, choices).with_call_cache(begins=True)
     return with_visible_inside(surface, is_clear=is_clear)
 

@@ -90,6 +90,7 @@ def intersect_surface(
     Newton step is made. A hit on a jump of f is not moved; its normal points to the side of larger
     values.
     """
+    # The march goes from t = 0 to t_max.
     trace = prepared.first_hit(o, d, 0, t_max, active)
     if not prepared.uses_ray_queue:
         return _refine_hits(prepared, _MarchedRays(o, d, trace))
@@ -220,6 +221,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 
     start = real(0), real(0), vector(0), vector(0)
     value, error, gradient, normal = update_where_active(active, sample_all, start, "at hits")
+    # (): no bounds in the neighborhood.
     return Sample(value, gradient, (), error, shading_normal=normal)
 
 
@@ -438,6 +440,7 @@ class CappedSolid:
             meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
         )
         hits_cap = starts_inside & ((t_enter > 0) | (t_leave < t_max))
+        # All other rays are tested from t = 0 to t_max.
         return hits_cap | self.prepared.occluded(o, d, 0, t_max, active & ~hits_cap)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:

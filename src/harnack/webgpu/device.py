@@ -170,11 +170,13 @@ class CompiledShader:
         entries = [
             {"binding": k, "resource": {"buffer": buffer}} for k, buffer in enumerate(buffers)
         ]
+        # The shader's three buffers are bindings 0 to 2 of its only group, 0.
         layout = self.pipeline.get_bind_group_layout(0)
         encoder = handle.create_command_encoder()
         compute_pass = encoder.begin_compute_pass()
         compute_pass.set_pipeline(self.pipeline)
         compute_pass.set_bind_group(0, handle.create_bind_group(layout=layout, entries=entries))
+        # Quotients are rounded up: surplus lanes end at once, as the shader compares with `count`.
         groups = -(-count // WORKGROUP)
         # The groups of lanes are arranged in a rectangle, as each axis is limited.
         groups_a_row = min(groups, _MAX_WORKGROUPS_PER_AXIS)
@@ -195,6 +197,8 @@ def pack_shader_data(shader: Shader, data: Mapping[str, Any]) -> Words:
     """
     tables = [as_words(data[label]) for label in shader.tables]
     numbers = [as_words(data[label])[:1] for label in shader.numbers]
+    # Before the tables stand two words (the number of lanes, and 0), the start of each table, and
+    # the numbers.
     tables_start = 2 + len(tables) + len(numbers)
     table_starts = tables_start + np.cumsum([0, *map(len, tables)])[:-1].astype(np.uint32)
     header = np.zeros(2, np.uint32)

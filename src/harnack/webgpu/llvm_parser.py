@@ -264,6 +264,8 @@ class _LLVMParser:
             instruction = _FLAGS.sub("", instruction.partition(", align ")[0])
             for pattern, action in self._patterns.get(instruction.partition(" ")[0], ()):
                 if (match := pattern.fullmatch(instruction)) is not None:
+                    # With the name of the result, which a branch and a store lack, and the parts
+                    # that the pattern has found.
                     action(*((result,) if result else ()), *match.groups())
                     return
             raise UntranslatableError(
@@ -311,7 +313,9 @@ class _LLVMParser:
                 if text.startswith("0x")
                 else float(text)
             )
+            # The bits of the number in single precision.
             return Constant(kind, struct.unpack("<I", struct.pack("<f", double))[0])
+        # Negative integers as their 32 bits.
         return Constant(kind, int(text) & 0xFFFFFFFF)
 
     def _emit(self, result: str, kind: Kind, name: str, *operands: Operand) -> None:
@@ -587,7 +591,7 @@ class _LLVMParser:
         stem = re.sub(r"\.(?:v\d+\w*|ps|f32|i32|ss)\b.*", "", function)
         if stem in _UNARY_CALLS:
             self._emit(result, kind, _UNARY_CALLS[stem], self._value(operands[0], kind))
-        elif len(operands) == _CALLS.get(stem, -1):
+        elif len(operands) == _CALLS.get(stem, -1):  # -1: an unknown function
             self._emit(result, kind, stem, *(self._value(operand, kind) for operand in operands))
         else:
             raise UntranslatableError(

@@ -112,6 +112,7 @@ class _WGSLWriter:
 
     def __init__(self, kernel: ComputeKernel) -> None:
         self._kernel = kernel
+        # The parameters of each kind, each of them once.
         slots: dict[str, list[int]] = {"number": [], "table": [], "lane": []}
         self._stores: list[Store] = []
         for statement in kernel.walk():
@@ -133,6 +134,8 @@ class _WGSLWriter:
             for source, parameters in self._buffer_slots.items()
         }
         results = tuple(self._label(statement.parameter) for statement in self._stores)
+        # Workgroups form a rectangle, since each axis is limited. The words `count` and `zero` are
+        # the number of lanes, and a 0 that the compiler does not know.
         code = "\n".join(
             [
                 _PRELUDE,
@@ -210,6 +213,7 @@ class _WGSLWriter:
         place = self._buffer_slots[load.source].index(load.parameter)
         if load.source == "lane":
             bits = f"lanes[{place}u * count + lane]"
+        # Two words and the starts of all tables precede the numbers.
         elif load.source == "number":
             bits = f"data[{2 + len(self._buffer_slots['table']) + place}]"
         else:
@@ -256,7 +260,7 @@ class _WGSLWriter:
             case "sdiv" | "srem":
                 operator = "/" if name == "sdiv" else "%"
                 return f"bitcast<u32>({_as_signed(a[0])} {operator} {_as_signed(a[1])})"
-            case "smin" | "smax":
+            case "smin" | "smax":  # WGSL's min and max
                 return f"bitcast<u32>({name[1:]}({_as_signed(a[0])}, {_as_signed(a[1])}))"
             case "iabs":
                 return f"bitcast<u32>(abs({_as_signed(a[0])}))"
@@ -291,6 +295,7 @@ class _WGSLWriter:
             return "true" if value.bits else "false"
         if value.kind == "u32":
             return f"{value.bits}u"
+        # The float that has these bits, and its biased exponent.
         number: float = struct.unpack("<f", struct.pack("<I", value.bits))[0]
         exponent = (value.bits >> 23) & 255
         # Infinity or NaN. A compiler must not know the bits, so a zero from a buffer is mixed in.
