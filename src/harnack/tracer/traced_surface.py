@@ -248,6 +248,8 @@ class TracedSurface:
         """Return the grid of cells with a mark on those that may contain a level of the surface;
         None if no cells are known. If only the largest component is traced, only its cells are
         marked."""
+        # `largest` is a number of cells, 0 for all components. Results are kept for this field,
+        # these levels and a key; the key has what else they depend on.
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
