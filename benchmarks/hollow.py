@@ -16,7 +16,8 @@ import scipy.spatial
 import trimesh
 
 import harnack as hk
-from harnack.meshing.checks import MeshingError, intersecting_faces
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
 
 from .repair import is_solid
 

@@ -21,7 +21,7 @@ import trimesh
 import harnack as hk
 from harnack.field_from_file import read_geometry
 from harnack.geometry.example_meshes import torus_mesh
-from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.self_intersection import intersecting_faces
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

@@ -22,7 +22,7 @@ from harnack.fields.samples import Ray, value_error_bound
 from harnack.fields.solids.fractal import CORNERS, lattice_vector
 from harnack.geometry import example_meshes
 from harnack.meshing.closed_mesh import from_manifold, to_manifold
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.testing import check_field
 from tests.oracles.mesh_distance import signed_distance
 

@@ -20,7 +20,7 @@ from harnack.live import live_scene
 from harnack.live.live_scene import LiveScene, state_delta
 from harnack.live.session import MessageHandler, RequestError, Session
 from harnack.live.sliders import extreme_slider_values
-from harnack.meshing.checks import LocalizedMeshingError
+from harnack.meshing.meshing_errors import LocalizedMeshingError
 from harnack.rendering import studio_surfaces
 
 LOOP = example_curves.torus_knot(2, 3, 18)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
-from harnack.meshing import broad_phase, checks
+from harnack.meshing import broad_phase, self_intersection
 from harnack.meshing.broad_phase import near_pairs
-from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from tests.oracles.triangle_pairs import intersecting_pairs
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -61,7 +61,7 @@ def test_the_same_faces_are_found_as_with_all_pairs_of_boxes(
     vertices, faces = make()  # type: ignore[operator]
     some = np.random.default_rng(4).random(len(faces)) < 0.3
     by_boxes = [intersecting_faces(vertices, faces, among).tolist() for among in (None, some)]
-    monkeypatch.setattr(checks, "_MIN_FACES_FOR_KERNEL", 0)
+    monkeypatch.setattr(self_intersection, "_MIN_FACES_FOR_KERNEL", 0)
     by_tree = [intersecting_faces(vertices, faces, among).tolist() for among in (None, some)]
     assert by_tree == by_boxes
     assert by_tree[0]

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 import harnack as hk
 from harnack.geometry import example_curves
 from harnack.meshing import checks
-from harnack.meshing.checks import intersecting_faces
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.mesh_improvement import least_angles, relax_vertices
+from harnack.meshing.self_intersection import intersecting_faces
 from tests.oracles.oracle import CurveOracle
 from tests.oracles.triangle_pairs import intersecting_pairs
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
-from harnack.meshing.checks import intersecting_faces, orient2d, orient3d
+from harnack.meshing.exact_predicates import orient2d, orient3d
+from harnack.meshing.self_intersection import intersecting_faces
 
 # A rotation without short decimals: coplanar corners are not in planes of three coordinates.
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.meshing.checks import EmptySurfaceError
 from harnack.meshing.lost_parts import _are_farther
+from harnack.meshing.meshing_errors import EmptySurfaceError
 from tests.meshing.test_sign_isosurface import sphere_points
 
 LOST = "not quite the level of this"

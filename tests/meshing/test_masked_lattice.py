@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.geometry.mesh_edges import boundary_edges
 from harnack.meshing import csg_meshing
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import check_manifold, check_no_self_intersection
-from harnack.meshing.edges import boundary_edges
 from harnack.meshing.lattice_meshing import IrrelevantRegion, mesh_closed_surface
 from harnack.meshing.level_function import LevelFunction
 

@@ -13,18 +13,12 @@ import trimesh
 import harnack as hk
 from harnack.cli.mesh_files import write_mesh
 from harnack.geometry.example_meshes import bumpy_sphere
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    TriangleLimitError,
-    check_inside,
-    check_near_level,
-    check_no_self_intersection,
-)
+from harnack.meshing.checks import check_inside, check_near_level, check_no_self_intersection
 from harnack.meshing.closed_export import ClosedMesh
 from harnack.meshing.finishing import simplify_mesh
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.meshing_errors import LocalizedMeshingError, MeshingError, TriangleLimitError
+from harnack.meshing.triangle_mesh import TriangleMesh
 from tests.oracles.extents import longest_side
 from tests.oracles.mesh_files import read_closed
 

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.meshing.clipping import drop_degenerate_components
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.components import drop_degenerate_components
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 BALL = trimesh.creation.icosphere(2)
 

@@ -7,15 +7,11 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.meshing.checks import (
-    OffLevelError,
-    check_manifold,
-    check_near_level,
-    check_no_self_intersection,
-)
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.checks import check_manifold, check_near_level, check_no_self_intersection
 from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.meshing_errors import OffLevelError
 from harnack.meshing.outlier_projection import project_outliers
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 TOLERANCE = 0.005
 FUNCTION = LevelFunction(hk.Sphere(1.0), 0.0)

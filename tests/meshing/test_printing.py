@@ -15,10 +15,10 @@ import trimesh
 import harnack as hk
 from harnack.cli import main
 from harnack.geometry import example_curves
-from harnack.meshing import checks, clipping, finishing
+from harnack.meshing import checks, components, thickening
 from harnack.meshing.bcc_lattice import BccLattice
-from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 from tests.oracles.extents import longest_side
 from tests.oracles.mesh_files import read_closed
 
@@ -279,7 +279,7 @@ def test_beyond_its_reach_a_surface_is_made_of_hulls() -> None:
 
 
 def test_too_many_hulls_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finishing, "_MOST_HULLS", 10)
+    monkeypatch.setattr(thickening, "_MOST_HULLS", 10)
     with pytest.raises(hk.MeshingError, match="reach"):
         hk.mesh(hk.Sphere(0.3), thickness=0.8, tolerance=0.03, cell_size=0.2)
 
@@ -364,7 +364,7 @@ def test_cavities_belong_to_the_innermost_shell_around_them() -> None:
             [one + k * n for k, one in enumerate(faces)]))  # fmt: skip
 
     def kept(surface: TriangleMesh) -> float:
-        body = clipping.largest_body(surface)
+        body = components.largest_body(surface)
         return float(trimesh.Trimesh(body.vertices, body.faces, process=False).volume)
 
     whole = float(ball.volume)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.meshing.checks import intersecting_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from tests.oracles.direct_sums import winding_sum
 
 Function = Callable[[Any], Any]

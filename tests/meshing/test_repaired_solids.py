@@ -13,12 +13,12 @@ import trimesh
 
 import harnack as hk
 from harnack.geometry.example_meshes import icosphere
+from harnack.geometry.mesh_edges import distance_from_triangles
 from harnack.meshing.bodies import closed_parts
-from harnack.meshing.edges import distance_from_triangles
 from harnack.meshing.intended_solid import IntendedSolid
 from harnack.meshing.joined_pieces import boundary_of_solid
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.marching_tetrahedra import delaunay
+from harnack.meshing.triangle_mesh import TriangleMesh
 from tests.oracles.direct_sums import winding_sum
 from tests.oracles.mesh_distance import distances_to_triangles
 from tests.oracles.triangle_pairs import intersecting_pairs

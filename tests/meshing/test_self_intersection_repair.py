@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 
 from harnack.geometry.example_meshes import icosphere
-from harnack.meshing.checks import (
-    SelfIntersectionError,
-    check_manifold,
-    check_no_self_intersection,
-    intersecting_faces,
-)
-from harnack.meshing.edges import boundary_edges
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.mesh_edges import boundary_edges
+from harnack.meshing.checks import check_manifold, check_no_self_intersection
+from harnack.meshing.meshing_errors import SelfIntersectionError
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import (
     resolve_local_intersections,
     resolve_self_intersections,
 )
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 
 def with_slivers(count: int, depth: float) -> TriangleMesh:

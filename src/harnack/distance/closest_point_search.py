@@ -46,6 +46,7 @@ from harnack.fields.batch_evaluation import morton_order
 from harnack.fields.capabilities import NO_FACET, exactly_sampled
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field
+from harnack.geometry.neighborhoods import kd_tree
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -274,10 +275,7 @@ def _with_singular_points(
         singular = singular[surface.clip_volume.contains_points(singular)]
     if not len(singular) or not len(points):
         return closest
-    import scipy.spatial  # imported here: it takes half a second, and few calls need it
-
-    spatial: Any = scipy.spatial
-    distance, rows = spatial.cKDTree(singular).query(points)
+    distance, rows = kd_tree(singular).query(points)
     # Written with `not <=`, so that it is True where there is no closest point (NaN).
     is_nearer = ~(_length(points - closest) <= distance)
     return np.where(is_nearer[:, None], singular[rows], closest)

@@ -22,6 +22,7 @@ from harnack.enclosures import Levels
 from harnack.fields.clearance import frame_parameters, level_distance_lower_bound, round_to_single
 from harnack.fields.field import EvaluateOnly
 from harnack.fields.solids.mesh_solid import MeshSolid
+from harnack.geometry.mesh_edges import area_normals
 from harnack.tree import build_balanced_tree
 from harnack.tree.closest_triangles import initial_squared_distance, next_closest_triangle
 from harnack.tree.triangle_splitting import separates_levels, split_intersecting_faces
@@ -161,7 +162,7 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     (clearances,) = in_batches(backend, clearance, center)
     # The ball about the center that contains the triangle.
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = area_normals(corners)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # f right beside the center, on both sides.
     offset = _SIDE_DISTANCE * size * normal / np.maximum(length, 1e-300)

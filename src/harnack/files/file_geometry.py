@@ -9,6 +9,7 @@ import errno
 import os
 import secrets
 import tempfile
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,19 +118,44 @@ class FileGeometry:
     polylines: PolygonList = NO_POLYGONS
 
 
-def ranks_in_lists(sizes: IntArray) -> IntArray:
-    """Return the position of each entry within its own list (0, 1, ..., size - 1), for lists that
-    are stored one after the other in one array. sizes: (m,) the lengths of the lists."""
-    ranks = np.arange(int(sizes.sum()), dtype=np.int64)
-    ranks -= np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return ranks
-
-
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
     """Return triangles as a `PolygonList`. corners: (m, 3) their vertex indices, which were read
     from the file `path`."""
     sizes = np.full(len(corners), 3, dtype=np.int64)
     return PolygonList(corners.ravel(), sizes, FileLocations(path, "triangle", range(len(corners))))
+
+
+@contextlib.contextmanager
+def errors_of_trimesh(place: FileLocation, kind: str) -> Generator[None, None, None]:
+    """A context in which any error, such as trimesh raises for malformed files, becomes a
+    FileFormatError that says that `place` is no sound file of this kind; warnings are silenced."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except FileFormatError:
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise place.error(f"it is no sound {kind} file ({reason[0][:120]})") from None
+
+
+def placed_mesh(geometry: Any, matrix: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return the vertices (n, 3) of a mesh or of points that trimesh read, moved by the transform
+    `matrix` (4, 4); and the faces (m, 3), reversed if the transform makes a mirror image."""
+    x = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3))), np.int64)
+    return x, faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
+
+
+def joined_meshes(path: Path, meshes: list[tuple[FloatArray, IntArray]]) -> FileGeometry:
+    """Return meshes, given by vertices (n, 3) and faces (m, 3), as the geometry of the file `path`
+    from which they were read."""
+    import trimesh  # here, since it takes half a second
+
+    append_faces: Any = trimesh.util.append_faces
+    x, faces = append_faces(*zip(*meshes, strict=True))
+    return FileGeometry(path, x, faces=triangles_as_polygons(path, faces))
 
 
 def check_finite(coordinates: FloatArray, places: FileLocations) -> None:

@@ -42,6 +42,8 @@ from harnack.geometry.boundary_edges import (
 )
 from harnack.geometry.clouds import CloudError, as_cloud_points, as_unit_normals
 from harnack.geometry.curves import CurveError, validate_loops
+from harnack.geometry.flat_lists import next_in_lists
+from harnack.geometry.mesh_edges import area_normals
 from harnack.geometry.meshes import MeshError, without_zero_area_faces, zero_area_faces
 from harnack.geometry.polygons import triangulate
 from harnack.geometry.welding import Welded
@@ -404,11 +406,7 @@ def _looks_like_curves(contents: FileGeometry) -> bool:
         return False
     welded = weld_vertices(contents.vertices)
     begin = welded[faces.corners]
-    ends = np.cumsum(faces.sizes)
-    # The corner after each corner; after the last one of a polygon comes its first.
-    next_corner = np.arange(1, len(begin) + 1, dtype=np.int64)
-    next_corner[ends[faces.sizes > 0] - 1] = (ends - faces.sizes)[faces.sizes > 0]
-    end = begin[next_corner]
+    end = begin[next_in_lists(faces.sizes)]
     # A number for each edge, the same in both directions.
     keys = np.minimum(begin, end) * len(welded) + np.maximum(begin, end)
     # Polygons with fewer than three corners do not count.
@@ -461,7 +459,7 @@ def _mesh_to_cloud(mesh: LoadedMesh) -> LoadedCloud:
     """Return a cloud of points that stands for the triangles of a mesh: their centers, with their
     normals and areas."""
     corners = mesh.vertices[mesh.faces]
-    area_normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area_normal = 0.5 * area_normals(corners)
     area = np.linalg.norm(area_normal, axis=1)
     summary = f"{len(area):,} triangles, each taken as a point with its normal and area, as asked"
     return LoadedCloud(corners.mean(axis=1), area_normal / area[:, None], area, summary)

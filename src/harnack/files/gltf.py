@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -23,11 +22,12 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    FileFormatError,
     FileGeometry,
     FileLocation,
+    errors_of_trimesh,
+    joined_meshes,
+    placed_mesh,
     read_bytes,
-    triangles_as_polygons,
 )
 
 _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
@@ -58,25 +58,18 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
 
     place = FileLocation(path)
     header = _header(place, data)
-    try:
+    with errors_of_trimesh(place, "glTF"):
         files = _buffer_files(path, header)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            _check_header(place, header, len(data) + sum(map(len, files.values())))
-            scene: Any = trimesh.load(
-                BytesIO(data),
-                file_type=path.suffix.lower()[1:],
-                resolver=files,
-                force="scene",
-                process=False,
-                skip_materials=True,
-            )
-            return _contents(place, scene)
-    except FileFormatError:
-        raise
-    except Exception as error:  # trimesh raises any error for malformed files
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise place.error(f"it is no sound glTF file ({reason[0][:120]})") from None
+        _check_header(place, header, len(data) + sum(map(len, files.values())))
+        scene: Any = trimesh.load(
+            BytesIO(data),
+            file_type=path.suffix.lower()[1:],
+            resolver=files,
+            force="scene",
+            process=False,
+            skip_materials=True,
+        )
+        return _contents(place, scene)
 
 
 def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
@@ -249,43 +242,26 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     Raises:
         FileFormatError: an index out of range; neither triangles nor points.
     """
-    vertices: list[FloatArray] = []
-    faces: list[IntArray] = []
+    meshes: list[tuple[FloatArray, IntArray]] = []
     points: list[FloatArray] = []
-    vertex_count = 0
     for node in scene.graph.nodes_geometry:
         world_from_node, name = scene.graph[node]
         geometry = scene.geometry[name]
-        positions = _transformed(place, np.asarray(geometry.vertices), np.asarray(world_from_node))
+        positions, corners = placed_mesh(geometry, world_from_node)
+        if not math.isfinite(float(np.abs(positions).max(initial=0.0))):
+            raise place.error("coordinates must be finite")
         if not hasattr(geometry, "faces"):
             # Lines have entities; the other geometries are points.
             points += [] if hasattr(geometry, "entities") else [positions]
             continue
-        corners = np.asarray(geometry.faces, dtype=np.int64)
         if corners.size and (corners.min() < 0 or corners.max() >= len(positions)):
             raise place.error(
                 f"vertex {corners.max()} of mesh {name[:40]!r} is out of range: it has "
                 f"{len(positions):,} vertices"
             )
-        if np.linalg.det(world_from_node[:3, :3]) < 0.0:  # a mirror image, inside out
-            corners = corners[:, ::-1]
-        vertices.append(positions)
-        faces.append(corners + vertex_count)
-        vertex_count += len(positions)
-    if sum(map(len, faces)):
-        triangles = triangles_as_polygons(place.path, np.concatenate(faces))
-        return FileGeometry(place.path, np.concatenate(vertices), None, triangles)
+        meshes.append((positions, corners))
+    if any(len(corners) for _, corners in meshes):
+        return joined_meshes(place.path, meshes)
     if points:
         return FileGeometry(place.path, np.concatenate(points))
     raise place.error("its scene has neither triangles nor points")
-
-
-def _transformed(
-    place: FileLocation, vertices: FloatArray, world_from_node: FloatArray
-) -> FloatArray:
-    """Return the vertices (n, 3) moved by the transform `world_from_node` (4, 4). Raises a
-    FileFormatError for coordinates that are not finite."""
-    x = vertices.astype(np.float64) @ world_from_node[:3, :3].T + world_from_node[:3, 3]
-    if not math.isfinite(float(np.abs(x).max(initial=0.0))):
-        raise place.error("coordinates must be finite")
-    return x

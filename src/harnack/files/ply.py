@@ -31,9 +31,9 @@ from harnack.files.file_geometry import (
     check_finite,
     check_indices,
     have_mixed_sizes,
-    ranks_in_lists,
 )
 from harnack.files.text_tables import TextLines, excerpt, read_floats, split_content_lines
+from harnack.geometry.flat_lists import ranks_in_lists
 
 # PLY name of a type -> its code in `struct`
 _CODES = {

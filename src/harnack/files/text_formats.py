@@ -22,7 +22,6 @@ from harnack.files.file_geometry import (
     check_finite,
     check_indices,
     have_mixed_sizes,
-    ranks_in_lists,
     triangles_as_polygons,
 )
 from harnack.files.text_tables import (
@@ -35,6 +34,7 @@ from harnack.files.text_tables import (
     split_content_lines,
 )
 from harnack.geometry.boundary_edges import weld_vertices
+from harnack.geometry.flat_lists import ranks_in_lists
 
 
 def read_xyz(path: Path, data: bytes) -> FileGeometry:

@@ -4,7 +4,6 @@ millimeters."""
 from __future__ import annotations
 
 import importlib.util
-import warnings
 import zipfile
 from io import BytesIO
 from pathlib import Path
@@ -12,14 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     MAX_BYTES,
-    FileFormatError,
     FileGeometry,
     FileLocation,
     FileLocations,
     check_finite,
     check_indices,
+    errors_of_trimesh,
+    joined_meshes,
+    placed_mesh,
     triangles_as_polygons,
 )
 
@@ -62,16 +64,9 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
         raise place.error("this is no .3mf file: it is no zip archive") from None
     if size > MAX_BYTES:
         raise place.error(f"it has {size:,} bytes when unpacked: at most {MAX_BYTES:,} are read")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
-            return _contents(place, scene)
-    except FileFormatError:
-        raise
-    except Exception as error:  # trimesh raises any error for malformed files
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise place.error(f"it is no sound 3MF file ({reason[0][:120]})") from None
+    with errors_of_trimesh(place, "3MF"):
+        scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
+        return _contents(place, scene)
 
 
 def _contents(place: FileLocation, scene: Any) -> FileGeometry:
@@ -85,21 +80,16 @@ def _contents(place: FileLocation, scene: Any) -> FileGeometry:
     unit = str(scene.units or "millimeter").lower().removesuffix("s")
     if unit not in _UNITS:
         raise place.error(f"its unit, {unit[:40]!r}, is none of {', '.join(_UNITS)}")
-    vertices, faces, vertex_count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    meshes: list[tuple[FloatArray, IntArray]] = []
     for node in scene.graph.nodes_geometry:
         matrix, name = scene.graph[node]
         geometry = scene.geometry[name]
-        corners = np.asarray(geometry.faces, np.int64)
-        polygons = triangles_as_polygons(place.path, corners)
+        polygons = triangles_as_polygons(place.path, np.asarray(geometry.faces, np.int64))
         check_indices(polygons, len(geometry.vertices))
-        x = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        if np.linalg.det(matrix[:3, :3]) < 0:  # a mirror image: faces must be reversed
-            corners = corners[:, ::-1]
-        vertices.append(_UNITS[unit] * x)
-        faces.append(corners + vertex_count)
-        vertex_count += len(x)
-    x, triangles = np.concatenate(vertices), np.concatenate(faces)
-    check_finite(x, FileLocations(place.path, "vertex", range(len(x))))
-    if not len(triangles):
+        positions, corners = placed_mesh(geometry, matrix)
+        meshes.append((_UNITS[unit] * positions, corners))
+    if not any(len(corners) for _, corners in meshes):
         raise place.error("it holds no triangles")
-    return FileGeometry(place.path, x, faces=triangles_as_polygons(place.path, triangles))
+    joined = joined_meshes(place.path, meshes)
+    check_finite(joined.vertices, FileLocations(place.path, "vertex", range(len(joined.vertices))))
+    return joined

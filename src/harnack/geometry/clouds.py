@@ -29,6 +29,7 @@ from harnack.backend.validation import (
     others_suffix,
 )
 from harnack.geometry.boundary_edges import weld_vertices
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.geometry.voronoi_areas import TangentVoronoi
 
 __all__ = ["CloudError", "estimate_areas", "estimate_normals", "validate_cloud"]
@@ -220,10 +221,7 @@ def build_point_tree(points: FloatArray) -> Any:
     """
     if len(points) < 2:
         raise CloudError("all points are at one position: a surface needs points beside each other")
-    import scipy.spatial  # imported here: it takes half a second, and few programs need it
-
-    spatial: Any = scipy.spatial
-    return spatial.cKDTree(points)
+    return kd_tree(points)
 
 
 def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArray, FloatArray]:

@@ -125,15 +125,16 @@ def solid_angles(corners: FloatArray, point: FloatArray) -> FloatArray:
 def _checked_arrays(vertices: Any, faces: Any) -> tuple[FloatArray, IntArray]:
     """Convert vertices to a new float64 array (n, 3) of finite numbers, and faces to a new int64
     array (m, 3) of valid indices. Raises `MeshError` if that is not possible."""
-    x = _as_vertices(vertices)
+    x = checked_vertices(
+        _as_array(vertices, "the vertices", "every vertex needs three coordinates")
+    )
     triangles = _as_faces(faces, len(x))
     return x, triangles
 
 
-def _as_vertices(vertices: Any) -> FloatArray:
-    """Convert vertices to a new float64 array (n, 3) of finite numbers. Raises `MeshError` if that
-    is not possible."""
-    array = _as_array(vertices, "the vertices", "every vertex needs three coordinates")
+def checked_vertices(array: npt.NDArray[Any]) -> FloatArray:
+    """Convert an array of vertices to a new float64 array (n, 3) of finite numbers. Raises
+    `MeshError` if that is not possible."""
     if array.size == 0:
         raise MeshError("there are no vertices: give an array (n, 3)")
     if array.dtype.kind not in "fiu":

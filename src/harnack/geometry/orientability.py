@@ -4,11 +4,11 @@ that no third face has; they agree in orientation if they run it in opposite dir
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
 
 from harnack.backend.validation import IntArray
+from harnack.geometry.mesh_edges import Edges, boundary_edges, half_edges
+from harnack.geometry.neighborhoods import connected_groups
 
 __all__ = ["is_nonorientable", "orientation_components"]
 
@@ -16,7 +16,7 @@ __all__ = ["is_nonorientable", "orientation_components"]
 def is_nonorientable(faces: IntArray) -> bool:
     """Whether a mesh has a boundary and all of its components are non-orientable, like a Moebius
     strip. A component is a largest set of faces connected through neighbors."""
-    if not (_face_edges(faces)[2] == 1).any():
+    if not len(boundary_edges(faces)):
         return False
     labels = orientation_components(faces)
     # A face and its reverse have the same label in a component that is non-orientable.
@@ -32,15 +32,9 @@ def orientation_components(faces: IntArray) -> IntArray:
     component of face k is non-orientable. (The labels are the components of the orientation double
     cover.)
     """
-    import scipy.sparse  # imported here, as it takes half a second and few programs need it
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     face_count = len(faces)
-    pairs, edge_of, use_count = _face_edges(faces)
-    order = np.argsort(edge_of, kind="stable")
-    # The two half-edges of each edge with exactly two faces.
-    first, second = order[(use_count == 2)[edge_of[order]]].reshape(-1, 2).T
+    pairs = half_edges(faces)
+    first, second = Edges.of(pairs).paired_half_edges().T
     # Both faces run the edge in the same direction: they disagree.
     is_reversed = ((pairs[first] == pairs[second]).all(axis=1)).astype(np.int64)
     first, second = first % face_count, second % face_count
@@ -50,17 +44,4 @@ def orientation_components(faces: IntArray) -> IntArray:
     columns = np.concatenate(
         [second + face_count * is_reversed, second + face_count * (1 - is_reversed)]
     )
-    adjacency = sparse.coo_matrix(
-        (np.ones(len(rows)), (rows, columns)), shape=(2 * face_count, 2 * face_count)
-    )
-    return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
-
-
-def _face_edges(faces: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The edges of all faces (m, 3). Returns the directed edges (3m, 2), the first edges of all
-    faces first; for each of them its index (3m,) among the undirected edges; and for each
-    undirected edge the number of faces that contain it."""
-    pairs = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]).astype(np.int64)
-    keys = pairs.min(axis=1) * (int(pairs.max(initial=0)) + 1) + pairs.max(axis=1)
-    _, edge_of, use_count = np.unique(keys, return_inverse=True, return_counts=True)
-    return pairs, edge_of, use_count
+    return connected_groups(np.column_stack([rows, columns]), 2 * face_count)

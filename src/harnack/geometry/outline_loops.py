@@ -14,6 +14,7 @@ import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.backend.validation import as_real_array, check_coordinate_size, check_finite
+from harnack.geometry.flat_lists import next_in_lists, ranks_in_lists
 
 __all__ = ["FillingRule", "Outline", "make_outline", "scale_for_clipper"]
 
@@ -117,11 +118,7 @@ def _edges_and_successors(loops: list[FloatArray]) -> tuple[FloatArray, FloatArr
     and for each edge the index (m,) of the next edge of the same loop."""
     start = np.concatenate(loops)
     end = np.concatenate([np.roll(loop, -1, axis=0) for loop in loops])
-    successor: IntArray = np.arange(1, len(start) + 1, dtype=np.int64)
-    last = np.array([len(loop) for loop in loops], dtype=np.int64).cumsum() - 1
-    # The last edge of each loop is followed by its first.
-    successor[last] = np.concatenate([[0], last[:-1] + 1])
-    return start, end, successor
+    return start, end, next_in_lists(np.array([len(loop) for loop in loops], dtype=np.int64))
 
 
 def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
@@ -149,10 +146,9 @@ def _self_intersects(loops: list[FloatArray], tolerance: float) -> bool:
     while begin < len(order):
         stop = begin + max(1, int(counts[begin:].cumsum().searchsorted(_PAIRS_PER_BATCH)))
         batch = counts[begin:stop]
-        # All pairs of the batch: edge order[rows] and the edge offset + 1 places later.
+        # All pairs of the batch: edge order[rows] and each of the edges up to its highest x.
         rows = np.arange(begin, stop).repeat(batch)
-        offset = np.arange(len(rows)) - (batch.cumsum() - batch).repeat(batch)
-        i, j = order[rows], order[rows + 1 + offset]
+        i, j = order[rows], order[rows + 1 + ranks_in_lists(batch)]
         is_near = (lower[i, 1] <= upper[j, 1]) & (lower[j, 1] <= upper[i, 1])
         is_near &= (successor[i] != j) & (successor[j] != i)
         i, j = i[is_near], j[is_near]

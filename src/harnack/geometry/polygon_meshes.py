@@ -15,19 +15,18 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.validation import (
-    TRANSPOSE_ADVICE,
     BoolArray,
     FloatArray,
     IntArray,
     as_real_array,
-    check_coordinate_size,
-    check_finite,
-    check_vectors,
     others_suffix,
 )
 from harnack.geometry.boundary_edges import boundary_edges, join_edges
 from harnack.geometry.convex_position import is_convex_position
-from harnack.geometry.meshes import MAX_FACES, MAX_VERTICES, MeshError
+from harnack.geometry.flat_lists import next_in_lists
+from harnack.geometry.mesh_edges import area_normals
+from harnack.geometry.meshes import MAX_FACES, MeshError, checked_vertices
+from harnack.geometry.neighborhoods import kd_tree
 
 __all__ = ["PolygonFaces", "cluster_into_polygons", "validate_polygons"]
 
@@ -77,9 +76,7 @@ class PolygonFaces:
     @property
     def next_corner(self) -> IntArray:
         """(k,) the index in `corners` of the next corner of the same loop."""
-        following = np.arange(1, len(self.corners) + 1, dtype=np.int64)
-        following[self.loop_starts + self.loop_sizes - 1] = self.loop_starts
-        return following
+        return next_in_lists(self.loop_sizes)
 
     @property
     def edges(self) -> IntArray:
@@ -173,7 +170,8 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
             that visits a vertex twice; an edge of length zero, or run twice by its face; a face
             whose vertices lie on a line.
     """
-    x = _checked_vertices(vertices)
+    ragged = "must all have 3 coordinates"
+    x = checked_vertices(as_real_array(vertices, "the vertices", MeshError, ragged=ragged))
     corners, sizes, face_of_loop = _flatten_faces(faces)
     bad = np.flatnonzero((corners < 0) | (corners >= len(x)))
     face = np.repeat(face_of_loop, sizes)
@@ -193,22 +191,6 @@ def validate_polygons(vertices: Any, faces: Any) -> PolygonFaces:
     for array in (x, corners, sizes, face_of_loop):
         array.setflags(write=False)
     return polygons
-
-
-def _checked_vertices(vertices: Any) -> FloatArray:
-    """Convert vertices to a new float64 array (n, 3) of finite numbers. Raises MeshError if that is
-    not possible."""
-    array = as_real_array(vertices, "the vertices", MeshError, ragged="must all have 3 coordinates")
-    if array.size == 0:
-        raise MeshError("there are no vertices: give an array (n, 3)")
-    check_vectors(array, "the vertices", MeshError, transposed=TRANSPOSE_ADVICE)
-    if len(array) > MAX_VERTICES:
-        raise MeshError(f"{len(array):,} vertices are too many: at most {MAX_VERTICES:,}")
-    x = np.array(array, dtype=np.float64, order="C")
-    advice = "coordinates must be finite; remove it and the faces that use it"
-    check_finite(x, "vertex {}", MeshError, advice)
-    check_coordinate_size(x, MeshError)
-    return x
 
 
 def _flatten_faces(faces: Any) -> tuple[IntArray, IntArray, IntArray]:
@@ -436,11 +418,8 @@ def _clusters(
     iterations: the number of Lloyd's steps.
     seed: the seed of the random initial centers.
     """
-    import scipy.spatial  # imported here: it takes half a second, and few programs need it
-
-    spatial: Any = scipy.spatial
     corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = area_normals(corners)
     area = np.linalg.norm(normal, axis=1)
     points = np.hstack([corners.mean(axis=1), _NORMAL_WEIGHT * normal / area[:, None]])
     probability = area / area.sum()
@@ -448,11 +427,11 @@ def _clusters(
     centers = points[rng.choice(len(points), count, p=probability, replace=False)]
     cluster_of = np.zeros(len(faces), dtype=np.int64)
     for _ in range(iterations):
-        cluster_of = spatial.KDTree(centers).query(points)[1]
+        cluster_of = kd_tree(centers).query(points)[1]
         weight = np.bincount(cluster_of, area, count)
         for axis in range(points.shape[1]):
             moment = np.bincount(cluster_of, area * points[:, axis], count)
             centers[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
         centers = centers[weight > 0]
         count = len(centers)
-    return spatial.KDTree(centers).query(points)[1]
+    return kd_tree(centers).query(points)[1]

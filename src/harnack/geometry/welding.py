@@ -7,15 +7,16 @@ All other vertices, and closed meshes, stay as they are."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
 from harnack.backend.validation import FloatArray, IntArray
 from harnack.geometry.boundary_edges import NetFaces, net_faces, singular_edges, weld_vertices
+from harnack.geometry.mesh_edges import has_distinct_corners, shortest_edges_at_vertices
 from harnack.geometry.meshes import zero_area_faces
+from harnack.geometry.neighborhoods import connected_groups, pairs_within
 
-__all__ = ["Welded", "connected_groups", "pairs_within", "rounding_of"]
+__all__ = ["Welded", "rounding_of"]
 
 # The distance, in units in the last place of the largest coordinate, that rounding explains.
 _MAX_ULPS = 4
@@ -101,11 +102,7 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
     representative = np.arange(len(positions))
     pairs = candidates[pairs_within(positions[candidates], rounding_of(positions[faces]))]
     distance = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
-    corners = positions[faces]
-    shortest_edge = np.full(len(positions), np.inf)
-    shortest_of_face = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-    for k in range(3):
-        np.minimum.at(shortest_edge, faces[:, k], shortest_of_face)
+    shortest_edge = shortest_edges_at_vertices(positions, faces)
     pairs = pairs[distance <= _MAX_EDGE_FRACTION * shortest_edge[pairs].min(axis=1)]
     while len(pairs):
         group = connected_groups(pairs, len(positions))
@@ -113,7 +110,7 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
         representative = np.unique(group, return_index=True)[1][group]
         joined = representative[faces]
         changed_faces = np.flatnonzero((joined != faces).any(axis=1))
-        is_degenerate = (joined == np.roll(joined, 1, axis=1)).any(axis=1)
+        is_degenerate = ~has_distinct_corners(joined)
         # Faces that lose their area by the joining.
         new_flat = changed_faces[zero_area_faces(positions, joined[changed_faces])]
         is_degenerate[np.setdiff1d(new_flat, zero_area_faces(positions, faces))] = True
@@ -123,24 +120,3 @@ def _joined_by_rounding(positions: FloatArray, faces: IntArray, candidates: IntA
         pairs = pairs[~np.isin(representative[pairs[:, 0]], kept_apart)]
         representative = np.arange(len(positions))
     return representative
-
-
-def pairs_within(points: FloatArray, distance: float) -> IntArray:
-    """The pairs of points (n, 3) that are at most `distance` apart, as indices (k, 2)."""
-    import scipy.spatial  # imported here: it takes half a second, and few programs need it
-
-    spatial = cast("Any", scipy.spatial)
-    pairs = spatial.cKDTree(points).query_pairs(distance, output_type="ndarray")
-    return np.asarray(pairs, np.int64).reshape(-1, 2)
-
-
-def connected_groups(pairs: IntArray, count: int) -> IntArray:
-    """The connected components of a graph with the nodes 0 to count - 1 and the edges `pairs` (k,
-    2). Returns the number (count,) of each node's component. Components are numbered in the order
-    of their first nodes."""
-    import scipy.sparse  # imported here: it takes half a second, and few programs need it
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import MeshingError, TriangleLimitError
-from harnack.meshing.edges import IntArray, sorted_unique
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import sorted_unique
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
 from harnack.tree.empty_space import BoxCells, Clearance, refine_cells
 
 __all__ = ["BccLattice", "distinct_rows"]

@@ -10,19 +10,28 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.geometry import MeshError
-from harnack.meshing.checks import SelfIntersectionError, check_manifold, intersecting_faces
-from harnack.meshing.clipping import winding_around
+from harnack.geometry.mesh_edges import (
+    area_normals,
+    half_edges,
+    row_dots,
+    row_norms,
+    unit_normals,
+)
+from harnack.geometry.neighborhoods import connected_groups
+from harnack.meshing.checks import check_manifold
 from harnack.meshing.closed_mesh import grown, to_manifold
+from harnack.meshing.components import winding_around
 from harnack.meshing.csg_meshing import apart_of
-from harnack.meshing.edges import IntArray, area_normals, half_edges, row_dots, row_norms
 from harnack.meshing.joined_pieces import boundary_of_solid, neighbors, passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import SelfIntersectionError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -77,14 +86,7 @@ def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
 
     x: (n, 3) the vertices.
     """
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    m = len(faces)
-    first, second = neighbors(x, faces).T % m
-    graph = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(m, m))
-    group = np.asarray(csgraph.connected_components(graph, directed=False)[1], np.int64)
+    group = connected_groups(neighbors(x, faces) % len(faces), len(faces))
     order = np.argsort(group, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
 
@@ -121,7 +123,7 @@ def nested(x: FloatArray, parts: list[IntArray]) -> list[list[int]]:
     for i, (low, high) in enumerate(boxes):
         depth = _TEST_DEPTH * float((high - low).max())
         sample = parts[i][:: max(1, len(parts[i]) // _TEST_POINTS)]
-        normals = _unit_normals(x[sample])
+        normals = unit_normals(x[sample])
         # Against the normals, or along them if the component is inside out.
         points = x[sample].mean(axis=1) - math.copysign(depth, volumes[i]) * normals
         # A container has a box that holds this box, a larger volume, and winds around all test
@@ -205,7 +207,7 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
     """
     corners = [shell.vertices[shell.faces] for shell in parts]
     size = float(np.ptp(np.concatenate(corners), axis=(0, 1)).max())
-    normals_of_part = [_unit_normals(corner) for corner in corners]
+    normals_of_part = [unit_normals(corner) for corner in corners]
     lows = [corner.min(axis=1) - _CONTACT_DISTANCE * size for corner in corners]
     highs = [corner.max(axis=1) + _CONTACT_DISTANCE * size for corner in corners]
     moved = [parts[0]]
@@ -233,13 +235,6 @@ def _make_overlap(parts: list[TriangleMesh]) -> list[TriangleMesh]:
                     x[faces[face]] = parts[k].vertices[faces[face]] + _OVERLAP * size * normal
         moved.append(TriangleMesh(x, faces))
     return moved
-
-
-def _unit_normals(corner: FloatArray) -> FloatArray:
-    """Unit normals (m, 3) of triangles with corners `corner` (m, 3, 3), by the right-hand rule; 0
-    for triangles without an area."""
-    normal = area_normals(corner)
-    return normal / np.maximum(row_norms(normal), 1e-300)[:, None]
 
 
 def _union_of_components(components: list[TriangleMesh], within: float) -> TriangleMesh:

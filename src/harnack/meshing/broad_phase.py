@@ -6,7 +6,7 @@ face count. A lane is one of the many runs of a kernel on the device, each for o
 A tree of bounding boxes is searched for each face, and the pairs whose boxes overlap are listed:
 about eight for each face. The listed pairs are then tested in parallel, one pair in each lane.
 Nearly all pairs are proved apart by the sign of a determinant that rounding cannot change. The
-remaining pairs are decided by exact arithmetic (`checks.intersecting_faces`).
+remaining pairs are decided by exact arithmetic (`self_intersection.intersecting_faces`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy
 from harnack.backend.record_table import RecordTable
-from harnack.meshing.edges import IntArray
 from harnack.tree.balanced_tree import (
     NO_PRIMITIVE,
     LoopValues,

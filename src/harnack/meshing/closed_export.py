@@ -10,18 +10,18 @@ from typing import Any, cast
 import numpy as np
 import trimesh
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import has_distinct_corners, unique_with_inverse
+from harnack.meshing.checks import check_manifold
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
+from harnack.meshing.meshing_errors import (
     LocalizedMeshingError,
     MeshingError,
     SelfIntersectionError,
-    check_manifold,
-    intersecting_faces,
 )
-from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
-from harnack.meshing.edges import IntArray, unique_with_inverse
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["ClosedMesh"]
 
@@ -177,7 +177,7 @@ def _merge_on_grid(surface: TriangleMesh, step: float) -> tuple[FloatArray, IntA
     first = np.empty(len(x), np.int64)
     first[group[::-1]] = np.arange(len(x))[::-1]
     faces = first[group][surface.faces]
-    return x, faces, (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return x, faces, has_distinct_corners(faces)
 
 
 def _resolve_after_rounding(

@@ -10,13 +10,11 @@ import numpy as np
 
 from harnack.backend import FloatArray
 from harnack.geometry import Ball, Box, ConvexHull, HalfSpace, VolumeIntersection
+from harnack.geometry.mesh_edges import row_dots
 from harnack.geometry.outline_loops import Outline, scale_for_clipper
-from harnack.meshing.checks import (
-    MeshingError,
-    intersecting_faces,
-)
-from harnack.meshing.edges import row_dots
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold

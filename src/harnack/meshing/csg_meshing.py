@@ -23,7 +23,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
 
 import numpy as np
 
@@ -42,16 +42,8 @@ from harnack.fields.solids.transforms import TransformedSolid
 from harnack.fields.solids.tube import Tube
 from harnack.geometry import Ball, Box, Volume, VolumeIntersection
 from harnack.meshing.bcc_lattice import BccLattice
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    OffLevelError,
-    SelfIntersectionError,
-    TriangleLimitError,
-    check_manifold,
-    is_retry_promising,
-)
-from harnack.meshing.clipping import drop_degenerate_components
+from harnack.meshing.checks import check_manifold
+from harnack.meshing.clipping import snap_to_box
 from harnack.meshing.closed_mesh import (
     box_manifold,
     extruded_manifold,
@@ -62,11 +54,11 @@ from harnack.meshing.closed_mesh import (
     volume_manifold,
     without_short_edges,
 )
+from harnack.meshing.components import drop_degenerate_components
 from harnack.meshing.csg_rewrite import drop_cancelled_operands, factor_common_operands, flatten_csg
 from harnack.meshing.lattice_meshing import (
     IrrelevantRegion,
     MissedPartsError,
-    TriangleMesh,
     mesh_closed_surface,
     split_faces_off_level,
 )
@@ -75,9 +67,19 @@ from harnack.meshing.level_function import (
     LevelFunction,
     LevelSamples,
 )
+from harnack.meshing.meshing_errors import (
+    CELL_SIZE_RATIO,
+    LocalizedMeshingError,
+    MeshingError,
+    OffLevelError,
+    SelfIntersectionError,
+    TriangleLimitError,
+    is_retry_promising,
+)
 from harnack.meshing.outlier_projection import project_outliers
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.meshing.tube_mesh import tube_manifold
 from harnack.tracer.traced_surface import CallCache
 
@@ -184,48 +186,34 @@ class CsgMesher:
         Raises:
             MeshingError: the solid or one of its operands cannot be meshed.
         """
-        from manifold3d import Manifold
-
-        if isinstance(solid, BooleanSolid):
-            apart = factor_common_operands(solid, level) if solid.is_union else None
-            if apart is not None:
-                return self.mesh_sublevel(apart, 0.0)
-            reduced = drop_cancelled_operands(flatten_csg(solid), level)
-            return Manifold() if reduced is None else self._mesh_boolean(reduced, level)
-        if isinstance(solid, Complement):  # -f <= c where f >= -c
-            return self._whole_box() - self.mesh_sublevel(solid.field, -level)
-        # f - distance <= c where f <= c + distance.
-        if isinstance(solid, OffsetSolid):
-            return self.mesh_sublevel(solid.field, level + solid.distance)
-        if isinstance(solid, BandSolid):
-            return self._mesh_wall(solid, level)
-        if isinstance(solid, SublevelSolid) and isinstance(solid.field, Solid):
-            return self.mesh_sublevel(solid.field, level)
-        if isinstance(solid, TransformedSolid) and not is_single_level_set(solid.field):
-            return self._mesh_transformed(solid, level)
-        # A box shrunk by -level keeps its sharp edges; a box that grows gets round ones.
-        if isinstance(solid, Cuboid) and solid.radius == 0 and level <= 0:
-            half = 0.5 * np.array(solid.sides) + level
-            return box_manifold(-half, half) if (half > 0).all() else Manifold()
-        if isinstance(solid, Extrusion) and level == 0:
-            return extruded_manifold(
-                solid.loops, solid.height, solid.twist, solid.taper, self.tolerance
-            )
-        if isinstance(solid, SolidOfRevolution) and level == 0:
-            return revolved_manifold(solid.loops, self.tolerance)
-        if isinstance(solid, Thread) and level == 0:
-            low, high = float(self.lower[2]), float(self.upper[2])
-            return thread_manifold(solid, low, high, self.tolerance)
-        if isinstance(solid, Tube):
-            return tube_manifold(solid, level, self.tolerance)
-        if isinstance(solid, MeshSolid):
-            return (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
-        if isinstance(solid, Plane):
-            x, y, z = solid.normal
-            return self._whole_box().trim_by_plane((-x, -y, -z), -(solid.distance + level))
+        for kind, method in self.methods.items():
+            manifold = method(self, solid, level) if isinstance(solid, kind) else None
+            if manifold is not None:
+                return manifold
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
+        """Mesh the set {solid <= level} for a union or an intersection, after common operands were
+        factored out and operands that cancel were dropped."""
+        from manifold3d import Manifold
+
+        apart = factor_common_operands(solid, level) if solid.is_union else None
+        if apart is not None:
+            return self.mesh_sublevel(apart, 0.0)
+        reduced = drop_cancelled_operands(flatten_csg(solid), level)
+        return Manifold() if reduced is None else self._combine_operands(reduced, level)
+
+    def _mesh_box(self, box: Cuboid, level: float) -> Manifold | None:
+        """Mesh the set {box <= level} if its edges are sharp; None if they are round. A box shrunk
+        by -level keeps its sharp edges; a box that grows gets round ones."""
+        from manifold3d import Manifold
+
+        if box.radius != 0 or level > 0:
+            return None
+        half = 0.5 * np.array(box.sides) + level
+        return box_manifold(-half, half) if (half > 0).all() else Manifold()
+
+    def _combine_operands(self, solid: BooleanSolid, level: float) -> Manifold:
         """Mesh the set {solid <= level} for a union or an intersection: its operands are meshed and
         combined by manifold3d. If an operand of an intersection is a complement ~Q, it is not
         meshed; Q is meshed and cut away. If all operands are complements, the solids Q are cut from
@@ -471,10 +459,13 @@ class CsgMesher:
         self.evaluations += function.evaluations
         return to_manifold(surface)
 
-    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold:
-        """Mesh the set {solid <= level} for a solid under an affine map. The original solid is
-        meshed in the box around the preimage of this box, with a smaller tolerance if the map
-        stretches; its mesh is then mapped."""
+    def _mesh_transformed(self, solid: TransformedSolid, level: float) -> Manifold | None:
+        """Mesh the set {solid <= level} for a solid under an affine map; None if the original solid
+        is meshed as one level set, since then the mapped solid can be. The original solid is meshed
+        in the box around the preimage of this box, with a smaller tolerance if the map stretches;
+        its mesh is then mapped."""
+        if is_single_level_set(solid.field):
+            return None
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -499,6 +490,46 @@ class CsgMesher:
         self.smallest_cell = min(self.smallest_cell, local.smallest_cell * scale)
         return manifold.transform(np.column_stack([matrix, offset]))
 
+    # How solids of each class are meshed if not as one level set. A method returns None if it does
+    # not apply to the given solid and level; then the solid is meshed as one level set after all.
+    methods: ClassVar[dict[type[Solid], Callable[[CsgMesher, Any, float], Manifold | None]]] = {
+        BooleanSolid: _mesh_boolean,
+        # -f <= c where f >= -c.
+        Complement: lambda self, solid, level: (
+            self._whole_box() - self.mesh_sublevel(solid.field, -level)
+        ),
+        # f - distance <= c where f <= c + distance.
+        OffsetSolid: lambda self, solid, level: self.mesh_sublevel(
+            solid.field, level + solid.distance
+        ),
+        BandSolid: _mesh_wall,
+        SublevelSolid: lambda self, solid, level: (
+            self.mesh_sublevel(solid.field, level) if isinstance(solid.field, Solid) else None
+        ),
+        TransformedSolid: _mesh_transformed,
+        Cuboid: _mesh_box,
+        Extrusion: lambda self, solid, level: (
+            extruded_manifold(solid.loops, solid.height, solid.twist, solid.taper, self.tolerance)
+            if level == 0
+            else None
+        ),
+        SolidOfRevolution: lambda self, solid, level: (
+            revolved_manifold(solid.loops, self.tolerance) if level == 0 else None
+        ),
+        Thread: lambda self, solid, level: (
+            thread_manifold(solid, float(self.lower[2]), float(self.upper[2]), self.tolerance)
+            if level == 0
+            else None
+        ),
+        Tube: lambda self, solid, level: tube_manifold(solid, level, self.tolerance),
+        MeshSolid: lambda self, solid, level: (
+            (mesh_manifold(solid) if level == 0 else None) or self._mesh_offset(solid, level)
+        ),
+        Plane: lambda self, solid, level: self._whole_box().trim_by_plane(
+            tuple(-component for component in solid.normal), -(solid.distance + level)
+        ),
+    }
+
 
 def _is_complement_free(solid: Solid) -> bool:
     """Whether neither a solid nor any of its operands is a complement or a wall. (A wall counts
@@ -517,8 +548,7 @@ def is_single_level_set(solid: Solid) -> bool:
         return not isinstance(solid.field, Solid) or is_single_level_set(solid.field)
     if isinstance(solid, TransformedSolid):
         return is_single_level_set(solid.field)
-    with_edges = Cuboid | Plane | Extrusion | SolidOfRevolution | Thread | Tube | MeshSolid
-    return not isinstance(solid, BooleanSolid | Complement | OffsetSolid | BandSolid | with_edges)
+    return not isinstance(solid, tuple(CsgMesher.methods))
 
 
 def _sublevel_bounds(solid: MeshSolid, level: float) -> tuple[FloatArray, FloatArray]:
@@ -601,9 +631,8 @@ class _DomainExtendedFunction(LevelFunction):
 
 # The number of cells across a solid, unless a spacing is given.
 _CELLS_ACROSS = 24
-# How many sizes of cells are tried, and the ratio of each size to the one before.
+# How many sizes of cells are tried.
 _MAX_ATTEMPTS = 3
-_CELL_SIZE_RATIO = 0.6
 # Where operands were cut by each other, slivers (thin triangles) may pass through their neighbors
 # by rounding. They are removed by moving the surface by up to the first length, in tolerances; if
 # that fails, by up to the next.
@@ -736,10 +765,10 @@ def mesh_solid(
             raise first from too_large  # the first error is the cause
         except (MissedPartsError, LocalizedMeshingError) as failure:
             attempts, first = attempts - 1, first or failure
-            if not attempts or not is_retry_promising(failure, before, _CELL_SIZE_RATIO**attempts):
+            if not attempts or not is_retry_promising(failure, before, CELL_SIZE_RATIO**attempts):
                 raise
             before = failure
-            cell_size *= _CELL_SIZE_RATIO
+            cell_size *= CELL_SIZE_RATIO
             # More cells along a wave in proportion, as these may limit the size of cells.
             per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)
             if isinstance(failure, LocalizedMeshingError):
@@ -858,7 +887,7 @@ def _mesh_in_volume(
     manifold = mesher.mesh_sublevel(solid, level)
     mesher.report("putting the parts together")
     if volume is None:
-        volume = Box(_as_tuple(lower), _as_tuple(upper))
+        volume = Box(tuple(lower.tolist()), tuple(upper.tolist()))
         # If the solid ends inside the box, it need not be cut at the box.
         ends = np.array(manifold.bounding_box(), np.float64)
         if (ends[:3] > lower).all() and (ends[3:] < upper).all():
@@ -894,11 +923,6 @@ def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArr
     return lower, upper
 
 
-def _as_tuple(x: FloatArray) -> tuple[float, float, float]:
-    """The coordinates of a point (3,) as three floats."""
-    return float(x[0]), float(x[1]), float(x[2])
-
-
 def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     """The surface, with vertices moved onto the faces of boxes if they are outside, or within
     rounding of a face. The boxes are `volume` itself or, if it is an intersection of volumes, the
@@ -907,8 +931,5 @@ def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     vertices = surface.vertices
     for box in boxes:
         if isinstance(box, Box):
-            vertices = np.clip(vertices, *box.bounds())
-            for end in box.bounds():
-                near = np.abs(vertices - end) <= 1e-12 * (1 + np.abs(end))
-                vertices = np.where(near, end, vertices)
+            vertices = snap_to_box(np.clip(vertices, *box.bounds()), box, 1e-12)
     return TriangleMesh(vertices, surface.faces)

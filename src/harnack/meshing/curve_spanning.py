@@ -17,16 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.fields.solid_angles.solid_angle import SolidAngle
+from harnack.geometry.mesh_edges import boundary_edges, edge_keys
 from harnack.geometry.polygons import cancel_opposite_edges
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    check_manifold,
-    intersecting_faces,
-    misoriented_faces,
-)
+from harnack.meshing.checks import check_manifold, misoriented_faces
 from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     RefinementBalls,
@@ -35,7 +30,6 @@ from harnack.meshing.delaunay_points import (
     newton_to_level,
     sample_delaunay_points,
 )
-from harnack.meshing.edges import IntArray, boundary_edges, edge_keys
 from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
 from harnack.meshing.lattice_meshing import check_estimated_triangles
 from harnack.meshing.level_function import LevelFunction
@@ -47,7 +41,9 @@ from harnack.meshing.marching_tetrahedra import (
     extract_triangles,
     is_cut,
 )
+from harnack.meshing.meshing_errors import CELL_SIZE_RATIO, LocalizedMeshingError, MeshingError
 from harnack.meshing.refinement import improve, refine, smooth
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.tree.empty_space import BoxCells
 
 __all__ = ["SpanningMesh", "mesh_spanning_curve", "restore_curve_edges"]
@@ -192,8 +188,6 @@ _MOST_LOCAL = 4
 _MAX_EDGE_CELLS = 2.5
 # How often edges of the curve that are missing among those of the tetrahedra are halved.
 _MAX_HALVINGS = 4
-# The ratio of the size of smaller cells everywhere to the size before.
-_CELL_SIZE_RATIO = 0.6
 
 
 @dataclass(frozen=True)
@@ -339,7 +333,7 @@ def _mesh_with_retries(
     except MeshingError:
         if attempts == 1:
             raise
-    return _mesh_with_retries(task, _CELL_SIZE_RATIO * spacing, attempts - 1, finer)
+    return _mesh_with_retries(task, CELL_SIZE_RATIO * spacing, attempts - 1, finer)
 
 
 def _mesh_in_cells(

@@ -15,12 +15,12 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.edges import IntArray, row_dots, row_norms
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import limited_rows, row_dots, row_norms
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.tree.empty_space import BoxCells, RefinedCells, refine_cells
 
@@ -29,7 +29,10 @@ __all__ = [
     "RefinementBalls",
     "TetrahedronPoints",
     "box_cells",
+    "newton_to_level",
     "sample_delaunay_points",
+    "snap_to_level",
+    "to_multiple_roots",
 ]
 
 # All relative to the size of a cell, by experiment.
@@ -65,10 +68,7 @@ class RefinementBalls:
         """
         if not len(centers):
             return np.zeros(0, np.bool_)
-        import scipy.spatial  # imported here: it takes half a second
-
-        searching: Any = scipy.spatial
-        distance: FloatArray = searching.cKDTree(self.points).query(centers)[0]
+        distance: FloatArray = kd_tree(self.points).query(centers)[0]
         return distance < self.radius + radii
 
 
@@ -286,9 +286,6 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     """
     if not len(boundary.edges):
         return np.ones(len(points), np.bool_)
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     middle, half = 0.5 * (a + b), 0.5 * row_norms(b - a)
     distance = np.full(len(points), np.inf)
@@ -299,7 +296,7 @@ def _is_far(points: FloatArray, free: FloatArray, boundary: BoundaryCurve) -> Bo
     for exponent in np.unique(log2_half):
         rows = np.flatnonzero(log2_half == exponent)
         neighbor_count = min(8, len(rows))
-        nearest: IntArray = searching.cKDTree(middle[rows]).query(points, k=neighbor_count)[1]
+        nearest: IntArray = kd_tree(middle[rows]).query(points, k=neighbor_count)[1]
         index = rows[nearest.reshape(len(points), neighbor_count)]
         edge_vectors, offset = (b - a)[index], points[:, None] - a[index]
         fraction = np.clip(
@@ -347,17 +344,40 @@ def _move_onto_level(
     set.
     """
     near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
-    moved = newton_to_level(function, points[near], samples.select(near), 0.25 * size[near], walls)
+    size = size[near]
+    moved, new_samples, is_moved = snap_to_level(
+        function, points[near], samples.select(near), size,
+        0.25 * size, 1.5 * _SNAP_DISTANCE * size, walls,
+    )  # fmt: skip
+    is_moved &= _is_far(moved, free[near], boundary)
+    rows = near[is_moved]
+    points, is_on = points.copy(), np.zeros(len(points), np.bool_)
+    points[rows], is_on[rows] = moved[is_moved], True
+    return points, samples.replaced(rows, new_samples.select(is_moved)), is_on
+
+
+def snap_to_level(
+    function: LevelFunction,
+    points: FloatArray,
+    samples: LevelSamples,
+    size: FloatArray | float,
+    max_step: FloatArray,
+    max_distance: FloatArray | float,
+    walls: tuple[FloatArray, FloatArray] | None,
+    steps: int = 5,
+) -> tuple[FloatArray, LevelSamples, BoolArray]:
+    """Move points onto the level set by Newton's method (`newton_to_level`). Returns the moved
+    points (n, 3); their samples; and a mask (n,) of those that may be used: the method converged,
+    and moved the point by less than `max_distance` (n,).
+
+    size: (n,) the size of cells at the points, to which distances from the level set are compared.
+    """
+    moved = newton_to_level(function, points, samples, max_step, walls, steps)
     new_samples = function.sample(moved)
-    apart = row_norms(moved - points[near])
     slope = row_norms(new_samples.gradient)
     # |f| / |grad f|, an estimate of the distance, is tiny compared with the cell.
-    converged = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size[near], 1e-300)
-    converged &= (apart < 1.5 * _SNAP_DISTANCE * size[near]) & _is_far(moved, free[near], boundary)
-    rows = near[converged]
-    points, is_on = points.copy(), np.zeros(len(points), np.bool_)
-    points[rows], is_on[rows] = moved[converged], True
-    return points, samples.replaced(rows, new_samples.select(converged)), is_on
+    is_on_level = np.abs(new_samples.value) < 1e-9 * np.maximum(slope * size, 1e-300)
+    return moved, new_samples, is_on_level & (row_norms(moved - points) < max_distance)
 
 
 def newton_to_level(
@@ -394,7 +414,7 @@ def newton_to_level(
             length = row_norms(move)
         lost = ~np.isfinite(length)
         move[lost], length[lost] = 0.0, 0.0
-        moved = current + move * np.minimum(1, max_step[rows] / np.maximum(length, 1e-300))[:, None]
+        moved = current + limited_rows(move, max_step[rows])
         x[rows] = moved if walls is None else np.clip(moved, *walls)
         rows = rows[length > _CONVERGED * max_step[rows]]
         if k == steps - 1 or not len(rows):

@@ -21,29 +21,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.backend import IntArray
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError
 from harnack.geometry.boundary_edges import singular_loops
-from harnack.meshing.checks import (
-    LocalizedMeshingError,
-    MeshingError,
-    TriangleLimitError,
-    check_manifold,
-    intersecting_faces,
-    is_retry_promising,
-    nonmanifold_vertices,
-)
+from harnack.geometry.mesh_edges import Edges, area_normals, half_edges
+from harnack.meshing.checks import check_manifold, nonmanifold_vertices
 from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     RefinementBalls,
     box_cells,
     sample_delaunay_points,
 )
-from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges
 from harnack.meshing.level_function import LevelFunction
 from harnack.meshing.marching_tetrahedra import count_crossings, delaunay, extract_triangles
+from harnack.meshing.meshing_errors import (
+    LocalizedMeshingError,
+    MeshingError,
+    TriangleLimitError,
+    is_retry_promising,
+)
 from harnack.meshing.refinement import improve, refine, smooth, unrefined_midpoints
+from harnack.meshing.self_intersection import intersecting_faces
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray
@@ -231,10 +231,7 @@ def checked_boundary_edges(faces: IntArray) -> IntArray:
             f"{a} and {b}: such a mesh has no two sides there, and where all faces are kept none "
             "are left out"
         )
-    # For each edge, how often it is run toward the larger index minus how often the other way: 0
-    # for two faces that agree.
-    sign = np.bincount(index, np.where(pairs[:, 0] < pairs[:, 1], 1, -1), minlength=len(uses))
-    turned = np.flatnonzero((uses == 2) & (sign != 0))
+    turned = np.flatnonzero(edges.run_twice_alike(pairs))
     if len(turned):
         a, b = edges.vertices[turned[0]].tolist()
         raise MeshError(

@@ -30,18 +30,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import intersecting_faces
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     edge_keys,
     half_edges,
+    normals_at_vertices,
     row_dots,
     row_norms,
 )
+from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.refinement import split_faces
+from harnack.meshing.self_intersection import intersecting_faces
 
 __all__ = ["HoleFilling", "fill_holes", "hole_loops"]
 
@@ -196,9 +197,7 @@ def hole_loops(vertices: FloatArray, faces: IntArray, edges: IntArray) -> list[I
     for a, b in edges.tolist():
         leaving[a].append(b)
         arriving[b].append(a)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], area_normals(vertices[faces]))
+    normals = normals_at_vertices(vertices, faces)
     # following[a, b] = c: after the edge from a to b, the loop goes on to c.
     following: dict[tuple[int, int], int] = {}
     for v, starts in arriving.items():
@@ -711,14 +710,8 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     loops: the indices of the vertices of each loop.
     count: the number of vertices.
     """
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     edges = Edges.of(half_edges(new))
-    first, second = edges.paired_half_edges().T % len(new)
-    joined = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(new), len(new)))
-    part = np.asarray(csgraph.connected_components(joined, directed=False)[1])
+    part = connected_groups(edges.paired_half_edges() % len(new), len(new))
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)
     # For each edge, one of its faces.

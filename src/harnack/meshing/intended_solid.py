@@ -19,20 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import MeshError, validate_mesh, without_zero_area_faces
-from harnack.geometry.welding import Welded
-from harnack.meshing.bodies import closed_parts, nested, volume_of
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.geometry.mesh_edges import (
     area_normals,
     distance_from_triangles,
+    has_distinct_corners,
     row_dots,
     row_norms,
 )
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.welding import Welded
+from harnack.meshing.bodies import closed_parts, nested, volume_of
 from harnack.meshing.mesh_cleaning import against_neighbors
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["Difference", "IntendedSolid"]
 
@@ -155,7 +155,7 @@ class IntendedSolid:
         if welded.rounded:
             faces = joined
         # Faces that still have three different corners.
-        rows = np.flatnonzero((joined != np.roll(joined, 1, axis=1)).all(axis=1))
+        rows = np.flatnonzero(has_distinct_corners(joined))
         # Every face has its reverse: keep one of both.
         if not len(welded.net.faces):
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]

@@ -46,21 +46,21 @@ for all y in the ball around T with center c and radius R. So (b) holds if grad 
 its longest edge, a few times: grad F is the same in both halves, and (a) or (b) may hold in each.
 
 Near the curve nothing is proved. The proof is about the first triangles, before they are refined.
-It is checked that the refined triangles do not meet (`checks.intersecting_faces`) and that they
-face along the gradient. It is not checked that they were moved without meeting on the way.
+It is checked that the refined triangles do not meet (`self_intersection.intersecting_faces`) and
+that they face along the gradient. It is not checked that they were moved without meeting on the
+way.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.delaunay_points import BoundaryCurve, TetrahedronPoints
-from harnack.meshing.edges import IntArray
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["IsotopyCoverage", "isotopy_of"]
@@ -471,11 +471,8 @@ def _regular_on_walls(
 def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """Distances (n,) of points (n, 3) from the curve `boundary`, measured to nine points of each of
     its edges. They are too large by at most a sixteenth of the longest edge."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
     fraction = np.linspace(0, 1, 9)[:, None, None]
     curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
-    distances: FloatArray = searching.cKDTree(curve_points).query(points)[0]
+    distances: FloatArray = kd_tree(curve_points).query(points)[0]
     return distances

@@ -17,13 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend
 from harnack.geometry.boundary_edges import singular_edges
+from harnack.geometry.flat_lists import ranks_in_lists
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    half_edges,
+    has_distinct_corners,
+    row_dots,
+    row_norms,
+)
 from harnack.geometry.meshes import without_zero_area_faces
-from harnack.geometry.welding import connected_groups, pairs_within
-from harnack.meshing.checks import MeshingError, touching_pairs
-from harnack.meshing.edges import Edges, IntArray, area_normals, half_edges, row_dots, row_norms
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import touching_pairs
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.tree import build_balanced_tree
 from harnack.tree.coplanar import overlapping_faces
 from harnack.tree.triangle_splitting import split_intersecting_faces, windings_of_sides
@@ -90,7 +99,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     first_at_place = np.unique(group, return_index=True)[1][group]  # corners of the mesh come first
     joined = first_at_place[len(x) :].reshape(-1, 3)
     # Pieces of which two corners became one vertex have no area.
-    joined = joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+    joined = joined[has_distinct_corners(joined)]
     joined = _cut_at_corners(points, joined)
     all_vertices = np.concatenate([x, cut.center + cut.size * points[len(x) :]])
     return TriangleMesh.without_unused_vertices(*_apart_at_contacts(all_vertices, joined))
@@ -164,8 +173,7 @@ class _Cut:
             np.searchsorted(self.owner[order], covered, side=side) for side in ("left", "right")
         )
         count = end - start
-        offset = np.cumsum(count) - count
-        rows = order[np.arange(int(count.sum())) + np.repeat(start - offset, count)]
+        rows = order[np.repeat(start, count) + ranks_in_lists(count)]
         triangle = self.unit[self.faces[np.repeat(covering, count)]]
         piece_center, normal = self.pieces[rows].mean(axis=1), area_normals(triangle)
         is_within = np.ones(len(rows), np.bool_)
@@ -233,14 +241,11 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
         The indices (k,) of these vertices, 0 for an edge without one; and a mask (k,) of the edges
         that have one.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     corners = np.unique(edges)
     p, q = x[edges[:, 0]], x[edges[:, 1]]
     half_length = 0.5 * row_norms(q - p)
     # Candidates lie in the ball that has the edge as its diameter.
-    nearby = searching.cKDTree(x[corners]).query_ball_point(0.5 * (p + q), half_length)
+    nearby = kd_tree(x[corners]).query_ball_point(0.5 * (p + q), half_length)
     count = np.array([len(group) for group in nearby])
     edge_row = np.repeat(np.arange(len(edges)), count)
     candidate = corners[

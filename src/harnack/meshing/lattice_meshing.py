@@ -18,26 +18,27 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.geometry.welding import connected_groups, pairs_within
-from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
-from harnack.meshing.checks import (
-    MeshingError,
-    TriangleLimitError,
-    UnrefinableError,
-    nonmanifold_vertices,
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
+    row_norms,
+    sorted_unique,
+    unique_with_inverse,
+    unit_rows,
 )
+from harnack.geometry.neighborhoods import connected_groups, kd_tree, pairs_within
+from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
+from harnack.meshing.checks import nonmanifold_vertices
 from harnack.meshing.delaunay_points import (
     BoundaryCurve,
     TetrahedronPoints,
     newton_to_level,
+    snap_to_level,
     to_multiple_roots,
 )
-from harnack.meshing.edges import IntArray, row_norms, sorted_unique, unique_with_inverse
 from harnack.meshing.isotopy import IsotopyCoverage, isotopy_of
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.marching_tetrahedra import (
@@ -46,7 +47,9 @@ from harnack.meshing.marching_tetrahedra import (
     count_crossings,
     extract_triangles,
 )
-from harnack.meshing.refinement import refine, smooth, smooth_within_tolerance
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError, UnrefinableError
+from harnack.meshing.refinement import fan_faces, refine, smooth, smooth_within_tolerance
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.tree.empty_space import Clearance
@@ -54,7 +57,6 @@ if TYPE_CHECKING:
 __all__ = [
     "IrrelevantRegion",
     "MissedPartsError",
-    "TriangleMesh",
     "check_estimated_triangles",
     "check_no_missed_parts",
     "mesh_closed_surface",
@@ -153,9 +155,6 @@ def check_no_missed_parts(
         MissedPartsError: parts are missed; it has points of the longest part.
         UnrefinableError: the function equals its level in a volume, or touches it along a surface.
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     rows = np.flatnonzero(~is_beside & (samples.distance < _MAX_SEED_DISTANCE * size))
     if not len(rows):
         return
@@ -181,7 +180,7 @@ def check_no_missed_parts(
     # Keep the points that are far from the mesh: near them, triangles are missing.
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
-        x = x[searching.cKDTree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
+        x = x[kd_tree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]
     part = _longest_part(x, _CLUSTER_DISTANCE * size)
@@ -210,7 +209,7 @@ def _thickness(function: LevelFunction, x: FloatArray, size: float) -> FloatArra
     both sides of the point at the smallest distance: the region is thinner than that. It is inf if
     the sign does not change again."""
     gradient = function.sample(x).gradient
-    direction = gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]
+    direction = unit_rows(gradient)
     distances = size * 2.0 ** np.arange(round(math.log2(_MIN_THICKNESS)), 1)
     nearest_is_above: list[BoolArray] = []
     thickness = np.full(len(x), np.inf)
@@ -268,7 +267,7 @@ def _check_passes_level(function: LevelFunction, points: FloatArray, size: float
         -1, 3, 3
     )
     steepest = gradients[np.arange(len(x)), (gradients**2).sum(axis=2).argmax(axis=1)]
-    direction = steepest / np.maximum(row_norms(steepest), 1e-300)[:, None]
+    direction = unit_rows(steepest)
 
     def along(s: FloatArray) -> FloatArray:
         """(k,) the function's values on the segments at the signed distances s (k,) from the points
@@ -364,31 +363,6 @@ _BORDER = 2.0
 # The number of cells along an edge of a block.
 _BLOCK = 8
 _MOST_ROUNDS = 20
-
-
-@dataclass(frozen=True)
-class TriangleMesh:
-    """A triangle mesh in space.
-
-    vertices: (n, 3).
-    faces: (m, 3) the indices of the vertices of each face, counter-clockwise as seen from the
-        outside, where the meshed function is larger."""
-
-    vertices: FloatArray
-    faces: IntArray
-
-    @classmethod
-    def without_unused_vertices(cls, vertices: FloatArray, faces: IntArray) -> TriangleMesh:
-        """The mesh of `faces` (m, 3) with only those of the `vertices` (n, 3) that a face uses.
-        Their order stays; faces are renumbered."""
-        used = np.flatnonzero(np.bincount(faces.ravel()))
-        index = np.full(len(vertices), -1, np.int64)
-        index[used] = np.arange(len(used))
-        return cls(vertices[used], index[faces])
-
-    def reversed(self) -> TriangleMesh:
-        """The same mesh with the orientation of all faces reversed."""
-        return TriangleMesh(self.vertices, self.faces[:, ::-1])
 
 
 @dataclass(frozen=True)
@@ -600,10 +574,9 @@ def split_faces_off_level(
         # Each of these faces becomes a fan of three around its new vertex. The new faces are the
         # last ones, and are examined in the next round.
         rows, new_vertices = pending[off_level], len(vertices) + np.arange(len(off_level))
-        a, b, c = faces[rows].T
         vertices = np.concatenate([vertices, moved])
-        fans = [np.stack([*ends, new_vertices], axis=1) for ends in ((a, b), (b, c), (c, a))]
-        faces = np.concatenate([np.delete(faces, rows, axis=0), *fans])
+        fans = fan_faces(faces[rows], new_vertices)
+        faces = np.concatenate([np.delete(faces, rows, axis=0), fans])
         pending = np.arange(len(faces) - 3 * len(rows), len(faces))
     return TriangleMesh(vertices, faces)
 
@@ -925,12 +898,10 @@ def _snap_points(
     size = float(lattice.size.min())
     near = np.flatnonzero((samples.distance < _SNAP_DISTANCE * size) & ~is_fixed)
     max_step = np.full(len(near), 0.5 * _SNAP_DISTANCE * size)
-    moved = newton_to_level(function, points[near], samples.select(near), max_step, walls, steps=4)
-    new_samples = function.sample(moved)
-    move = row_norms(moved - points[near])
-    gradient_length = row_norms(new_samples.gradient)
-    is_moved = np.abs(new_samples.value) < 1e-9 * np.maximum(gradient_length * size, 1e-300)
-    is_moved &= move < 1.2 * _SNAP_DISTANCE * size
+    moved, new_samples, is_moved = snap_to_level(
+        function, points[near], samples.select(near), size,
+        max_step, 1.2 * _SNAP_DISTANCE * size, walls, steps=4,
+    )  # fmt: skip
     rows = near[is_moved]
     # A point with a value of exactly 0 counts as on the level unmoved, so that all other points
     # have a sign.

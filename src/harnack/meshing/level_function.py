@@ -20,7 +20,7 @@ from harnack.fields.batch_evaluation import map_batches
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.formula import without_alternatives
 from harnack.fields.solids.mesh_solid import share_samples
-from harnack.meshing.edges import row_norms
+from harnack.geometry.mesh_edges import row_norms
 from harnack.tracer.traced_surface import CallCache
 
 if TYPE_CHECKING:

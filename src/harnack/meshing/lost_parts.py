@@ -23,16 +23,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.blobs.blobs import Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.meshing.checks import point_text
-from harnack.meshing.edges import IntArray, area_normals, distances_from_triangles, row_norms
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.mesh_edges import area_normals, distances_from_triangles, row_norms
+from harnack.geometry.neighborhoods import kd_tree
+from harnack.meshing.meshing_errors import point_text
 from harnack.meshing.sign_function import SignFunction
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.fields import Field
@@ -323,13 +324,10 @@ def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
     """An upper bound of the distances of all points (n, 3) from triangles (m, 3, 3): the largest
     distance of a point from the nearest corner or center of a triangle. It is inf if there are no
     triangles."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     if not len(triangles):
         return math.inf
     mesh_points = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
-    tree = searching.cKDTree(mesh_points, compact_nodes=False, balanced_tree=False)
+    tree = kd_tree(mesh_points, is_balanced=False)
     return float(tree.query(points)[0].max())
 
 
@@ -342,9 +340,6 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     point, where r is the largest distance of the triangle's corners from its center. Only such
     triangles are measured. Triangles whose r differ by less than a factor of 2 are searched
     together, with the larger r."""
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     is_far = np.ones(len(points), np.bool_)
     if not len(points):
         return is_far
@@ -354,7 +349,7 @@ def _are_farther(points: FloatArray, corner: FloatArray, distance: float) -> Boo
     exponent = np.ceil(np.log2(np.maximum(radius, distance))).astype(np.int64)
     for k in np.unique(exponent).tolist():
         remaining, rows = np.flatnonzero(is_far), np.flatnonzero(exponent == k)
-        tree = searching.cKDTree(center[rows], compact_nodes=False, balanced_tree=False)
+        tree = kd_tree(center[rows], is_balanced=False)
         nearby_faces = tree.query_ball_point(points[remaining], 2.0**k + distance)
         counts = np.array([len(indices) for indices in nearby_faces], np.int64)
         if not counts.sum():

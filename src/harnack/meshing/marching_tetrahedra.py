@@ -24,12 +24,18 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields import Field
-from harnack.meshing.checks import LocalizedMeshingError, MeshingError
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    edge_keys,
+    row_dots,
+    row_norms,
+)
 from harnack.meshing.delaunay_points import TetrahedronPoints
-from harnack.meshing.edges import Edges, IntArray, area_normals, edge_keys, row_dots, row_norms
 from harnack.meshing.level_function import LevelFunction
+from harnack.meshing.meshing_errors import LocalizedMeshingError, MeshingError
 
 __all__ = [
     "OUTSIDE_VALUE",

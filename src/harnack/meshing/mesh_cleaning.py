@@ -12,33 +12,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry.boundary_edges import weld_vertices
-from harnack.geometry.orientability import orientation_components
-from harnack.geometry.welding import connected_groups, pairs_within
-from harnack.meshing.checks import (
-    MeshingError,
-    check_manifold,
-    intersecting_faces,
-    nonmanifold_vertices,
-)
-from harnack.meshing.clipping import Shells, faces_to_flip
-from harnack.meshing.edges import (
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     half_edges,
+    has_distinct_corners,
     row_norms,
 )
+from harnack.geometry.neighborhoods import connected_groups, pairs_within
+from harnack.geometry.orientability import orientation_components
+from harnack.meshing.checks import check_manifold, nonmanifold_vertices
+from harnack.meshing.components import Shells, faces_to_flip
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.joined_pieces import passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["CleanedMesh", "against_neighbors", "clean_and_fill", "weld_near_corners"]
 
@@ -137,7 +133,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         count = np.bincount(group)[:, None]
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
         renumbered = group[corners]
-        welded_faces = renumbered[(renumbered != np.roll(renumbered, 1, axis=1)).all(axis=1)]
+        welded_faces = renumbered[has_distinct_corners(renumbered)]
         lost_edges = 3 * (
             len(faces) - len(welded_faces)
         )  # a lost triangle counts as three open edges
@@ -222,14 +218,7 @@ class _WorkingMesh:
         oriented = np.where(is_reversed[:, None], working.faces[:, ::-1], working.faces)
         pairs = half_edges(oriented)
         edges = Edges.of(pairs)
-        sign = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
-        # Two faces that agree run their common edge in opposite directions, so the sum is 0.
-        direction_sum = np.bincount(edges.edge_of_pair, sign, minlength=len(edges.multiplicity))
-        is_one_sided = (
-            ((edges.multiplicity == 2) & (direction_sum != 0))[edges.edge_of_pair]
-            .reshape(3, -1)
-            .any(axis=0)
-        )
+        is_one_sided = edges.run_twice_alike(pairs)[edges.edge_of_pair].reshape(3, -1).any(axis=0)
         working = _WorkingMesh(
             working.vertices,
             oriented,
@@ -343,13 +332,7 @@ def _pieces(edges: Edges, count: int) -> IntArray:
     faces.
 
     edges: the edges of the mesh, made from its `half_edges`. count: m, the number of faces."""
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
-    first, second = edges.paired_half_edges().T % count
-    adjacency = sparse.coo_matrix((np.ones(len(first)), (first, second)), shape=(count, count))
-    return np.asarray(csgraph.connected_components(adjacency, directed=False)[1], np.int64)
+    return connected_groups(edges.paired_half_edges() % count, count)
 
 
 def against_neighbors(x: FloatArray, faces: IntArray) -> BoolArray:

@@ -22,10 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     area_normals,
     boundary_edges,
     edge_keys,
@@ -33,7 +31,9 @@ from harnack.meshing.edges import (
     row_dots,
     row_norms,
     sorted_unique,
+    unit_rows,
 )
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.level_function import LevelFunction
 
 __all__ = ["collapse_slivers", "flip_edges", "least_angles", "relax_vertices"]
@@ -373,8 +373,7 @@ def _best_places(
         (k,) around the vertex there, in radians.
     """
     center, a, b = (vertices[stars.corners[:, k]] for k in range(3))
-    normal = np.cross(a - center, b - center)
-    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
+    normal = unit_rows(np.cross(a - center, b - center))
     middle = 0.5 * (a + b)
     # The position at which the triangle over the opposite edge has equal sides.
     apex = middle + np.sqrt(0.75) * np.cross(normal, b - a)

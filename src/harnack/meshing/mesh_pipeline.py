@@ -23,17 +23,14 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.geometry import Box, Volume
 from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import (
-    EmptySurfaceError,
-    MeshingError,
-    TriangleLimitError,
     check_inside,
     check_manifold,
     check_near_level,
     check_no_self_intersection,
-    is_retry_promising,
 )
-from harnack.meshing.clipping import clip_to_volume, largest_body, largest_component
+from harnack.meshing.clipping import clip_to_volume
 from harnack.meshing.closed_mesh import box_manifold, from_manifold, to_manifold, volume_manifold
+from harnack.meshing.components import largest_body, largest_component
 from harnack.meshing.csg_meshing import (
     AngleMesher,
     mesh_solid,
@@ -41,17 +38,18 @@ from harnack.meshing.csg_meshing import (
     solid_value_range,
 )
 from harnack.meshing.curve_spanning import mesh_spanning_curve
-from harnack.meshing.finishing import (
-    check_options,
-    simplify_mesh,
-    thicken,
-    to_trimesh,
-    vertex_normals,
-)
-from harnack.meshing.lattice_meshing import TriangleMesh, mesh_open_surface
+from harnack.meshing.finishing import check_options, simplify_mesh, to_trimesh, vertex_normals
+from harnack.meshing.lattice_meshing import mesh_open_surface
 from harnack.meshing.level_function import CELLS_PER_WAVE, MOST_FACES, LevelFunction
 from harnack.meshing.lost_parts import LostParts
 from harnack.meshing.mesh_tolerance import MeshTolerance
+from harnack.meshing.meshing_errors import (
+    CELL_SIZE_RATIO,
+    EmptySurfaceError,
+    MeshingError,
+    TriangleLimitError,
+    is_retry_promising,
+)
 from harnack.meshing.sign_function import (
     SignFunction,
     cell_size_for_smoothing,
@@ -59,10 +57,11 @@ from harnack.meshing.sign_function import (
     uses_sign_meshing,
 )
 from harnack.meshing.sign_isosurface import (
-    CELL_REFINEMENT_FACTOR,
     MAX_OFF_LEVEL_FRACTION,
     mesh_from_signs,
 )
+from harnack.meshing.thickening import thicken
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer import Surface
 from harnack.tracer.surface import intersection_of
@@ -451,9 +450,7 @@ def _cells_by_signs(field: Field, size: float, spacing: float | None) -> tuple[f
     if spacing is not None:
         return float(spacing), 1
     cell_size, attempts = size / _SIGN_CELLS, _SIGN_ATTEMPTS
-    smaller_size = cell_size_for_smoothing(
-        field, cell_size, CELL_REFINEMENT_FACTOR, CELL_REFINEMENT_FACTOR**2
-    )
+    smaller_size = cell_size_for_smoothing(field, cell_size, CELL_SIZE_RATIO, CELL_SIZE_RATIO**2)
     # Begin with smaller cells at once; that counts as the first attempt.
     return (smaller_size, attempts - 1) if smaller_size < cell_size else (cell_size, attempts)
 
@@ -790,10 +787,10 @@ def _mesh_in_lattice(
             attempts -= 1
             # Give up after the last attempt, or if even the smallest cells to come would not help.
             if not attempts or not is_retry_promising(
-                error, previous_error, CELL_REFINEMENT_FACTOR**attempts
+                error, previous_error, CELL_SIZE_RATIO**attempts
             ):
                 raise
-            previous_error, spacing = error, CELL_REFINEMENT_FACTOR * spacing
+            previous_error, spacing = error, CELL_SIZE_RATIO * spacing
             report(f"{error}; so smaller cells")
     facts = {
         "spacing": spacing,

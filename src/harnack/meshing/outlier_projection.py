@@ -14,14 +14,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import MeshingError, OffLevelError, intersecting_faces
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import edge_keys, half_edges, row_norms, sorted_unique
 from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.edges import IntArray, edge_keys, half_edges, row_norms, sorted_unique
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.level_function import LevelFunction
-from harnack.meshing.refinement import split_faces
+from harnack.meshing.meshing_errors import MeshingError, OffLevelError
+from harnack.meshing.refinement import fan_faces, split_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.self_intersection_repair import resolve_local_intersections
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["project_outliers"]
 
@@ -148,18 +149,13 @@ def _project_and_split(
     is_split = (vertex_on_edge >= 0).any(axis=1)
     split = split_faces(vertices, faces[is_split], vertex_on_edge[is_split])
     fan_centers = count + len(ends) + np.arange(len(fan_rows))
-    a, b, c = faces[fan_rows].T
-    new_faces = [
-        split,
-        *(np.stack([*edge, fan_centers], axis=1) for edge in ((a, b), (b, c), (c, a))),
-    ]
     # To be checked: new faces, and faces at moved vertices.
     removed_rows = np.union1d(np.flatnonzero(is_split), fan_rows)
     remaining = np.delete(faces, removed_rows, axis=0)
     is_moved = np.zeros(len(vertices), np.bool_)
     is_moved[moved_vertices] = True
     is_new = np.delete(is_new, removed_rows) | is_moved[remaining].any(axis=1)
-    faces = np.concatenate([remaining, *new_faces])
+    faces = np.concatenate([remaining, split, fan_faces(faces[fan_rows], fan_centers)])
     is_new = np.concatenate([is_new, np.ones(len(faces) - len(remaining), np.bool_)])
     return (vertices, faces), is_new
 

@@ -15,22 +15,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.backend.validation import as_positive
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.mesh_edges import Edges, half_edges, has_distinct_corners, longest_edges
 from harnack.geometry.welding import Welded
-from harnack.meshing.checks import (
-    intersecting_faces,
-    nonmanifold_vertices,
-    point_text,
-    touching_pairs,
-)
-from harnack.meshing.clipping import Shells
-from harnack.meshing.edges import Edges, IntArray, half_edges, row_norms
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.checks import nonmanifold_vertices
+from harnack.meshing.components import Shells
+from harnack.meshing.meshing_errors import point_text
+from harnack.meshing.self_intersection import intersecting_faces, touching_pairs
 from harnack.meshing.thickness import wall_thickness
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["PrintCheck", "PrintProblem", "check_print"]
 
@@ -245,17 +242,10 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
     x, faces: (n, 3), (m, 3) the mesh. Faces with two equal corners count only as faces without an
         area."""
     zero_area = zero_area_faces(x, faces)
-    has_equal_corners = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    proper_faces = faces[~has_equal_corners]
+    proper_faces = faces[has_distinct_corners(faces)]
     pairs = half_edges(proper_faces)
     edges = Edges.of(pairs)
     middle = x[edges.vertices].mean(axis=1)
-    # Two faces that agree run their common edge in opposite directions, so the sum is 0.
-    direction_sum = np.bincount(
-        edges.edge_of_pair,
-        np.where(pairs[:, 0] < pairs[:, 1], 1, -1),
-        minlength=len(edges.multiplicity),
-    )
     _, first, use_count = np.unique(
         np.sort(proper_faces, axis=1), axis=0, return_index=True, return_counts=True
     )
@@ -272,7 +262,7 @@ def _topology(x: FloatArray, faces: IntArray) -> list[PrintProblem]:
         ),
         _problem(
             "sides that disagree",
-            middle[(edges.multiplicity == 2) & (direction_sum != 0)],
+            middle[edges.run_twice_alike(pairs)],
             "at {} {edge|edges} neighboring faces do not agree on what is inside",
         ),
         _problem(
@@ -355,7 +345,7 @@ def _contacts(
     is_without_flat_faces = np.isin(
         shells.component_of_face, shells.component_of_face[is_flat], invert=True
     )
-    rows = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    rows = np.flatnonzero(has_distinct_corners(faces))
     # Duplicates are reported separately.
     rows = rows[np.unique(np.sort(faces[rows], axis=1), axis=0, return_index=True)[1]]
     crossing = intersecting_faces(x, faces[rows])
@@ -404,8 +394,7 @@ def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:
     length: thickness is measured at the centers of faces, so thin places beside these may be
     missed."""
     corner = x[faces]
-    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
-    centers = corner[longest > _COARSE * wall].mean(axis=1)
+    centers = corner[longest_edges(corner) > _COARSE * wall].mean(axis=1)
     text = f"{{}} {{triangle is|triangles are}} longer than {_COARSE:g} walls, and thickness is "
     text += "measured at centers"
     return _problem("walls measured coarsely", centers, text, is_fatal=False)

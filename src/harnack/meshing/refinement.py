@@ -17,22 +17,26 @@ from typing import Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import check_triangle_limit
-from harnack.meshing.delaunay_points import newton_to_level
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     half_edges,
+    limited_rows,
+    longest_edges,
     row_dots,
     row_norms,
+    unit_rows,
 )
+from harnack.meshing.checks import check_triangle_limit
+from harnack.meshing.delaunay_points import newton_to_level
 from harnack.meshing.level_function import LevelFunction, LevelSamples
 from harnack.meshing.mesh_improvement import collapse_slivers, flip_edges, relax_vertices
 
 __all__ = [
+    "cuts_off_crease",
+    "fan_faces",
     "improve",
     "refine",
     "smooth",
@@ -44,9 +48,9 @@ __all__ = [
 Walls = tuple[FloatArray, FloatArray] | None
 # A function from points (k, 3) to the mask (k,) of those that matter; None if all do.
 Where = Callable[[FloatArray], BoolArray] | None
-# An edge cuts off a crease if the normals at its ends differ by at least the first number, an
-# angle; and the normals at its middle and at one of its ends by at least the second number times
-# the angle between the normals at both ends.
+# At the ends of an edge that cuts off a crease, normals differ by more than the first number, an
+# angle; at a point between and at one of the ends by at least the second times the angle between
+# those at both ends.
 _CREASE, _SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
@@ -127,10 +131,8 @@ def refine(
         vertices = np.concatenate(
             [vertices, _crease_corners(function, vertices, faces[is_fan], walls)]
         )
-        a, b, c = faces[is_fan].T
-        fans = [np.stack([*ends, fan_centers], axis=1) for ends in ((a, b), (b, c), (c, a))]
         smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
-        faces = np.concatenate([smaller_faces, *fans])
+        faces = np.concatenate([smaller_faces, fan_faces(faces[is_fan], fan_centers)])
     if function.field.variable_accuracy is not None:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
@@ -193,20 +195,13 @@ def _project_to_creases(
     """
     used, vertex_rows = np.unique(ends, return_inverse=True)
     gradient = function.sample(vertices[used]).gradient
-    end_normals = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None])[
-        vertex_rows.reshape(-1, 2)
-    ]
-    midpoint_normal = function.sample(moved).gradient
-    midpoint_normal = midpoint_normal / np.maximum(row_norms(midpoint_normal), 1e-300)[:, None]
+    end_normals = unit_rows(gradient)[vertex_rows.reshape(-1, 2)]
+    midpoint_normal = unit_rows(function.sample(moved).gradient)
     n_a, n_b = end_normals[:, 0], end_normals[:, 1]
     cosine = row_dots(n_a, n_b)
-    angle_to_end = np.arccos(
-        np.clip(np.minimum(row_dots(n_a, midpoint_normal), row_dots(n_b, midpoint_normal)), -1, 1)
-    )
-    angle_of_ends = np.arccos(np.clip(cosine, -1, 1))
     # The last condition: the tangent planes are not nearly parallel, so that they meet in a line.
     rows = np.flatnonzero(
-        (angle_of_ends > _CREASE) & (angle_to_end > _SHARE * angle_of_ends) & (1 - cosine**2 > 0.01)
+        cuts_off_crease(n_a, n_b, midpoint_normal, _CREASE) & (1 - cosine**2 > 0.01)
     )
     if not len(rows):
         return moved
@@ -225,6 +220,26 @@ def _project_to_creases(
     return moved
 
 
+def cuts_off_crease(
+    first: FloatArray, second: FloatArray, between: FloatArray, min_angle: float
+) -> BoolArray:
+    """(k,) whether edges of a mesh cut off a crease of the surface. The normals at both ends differ
+    by more than `min_angle` (in radians), and those between the ends and at one of the ends by
+    nearly that angle. On a smooth surface the latter two differ by about half of it.
+
+    first, second: (k, 3) the normals of the surface at the ends of each edge.
+    between: (k, 3) those at a point of the surface between the ends.
+    """
+    angle_of_ends, angle_to_end = (
+        np.arccos(np.clip(cosine, -1, 1))
+        for cosine in (
+            row_dots(first, second),
+            np.minimum(row_dots(first, between), row_dots(second, between)),
+        )
+    )
+    return (angle_of_ends > min_angle) & (angle_to_end > _SHARE * angle_of_ends)
+
+
 def _crease_corners(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, walls: Walls
 ) -> FloatArray:
@@ -241,12 +256,9 @@ def _crease_corners(
     """
     corner = vertices[faces]
     center = corner.mean(axis=1)
-    longest_edge = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(
-        axis=0
-    )
+    longest_edge = longest_edges(corner)
     moved = newton_to_level(function, center, function.sample(center), 0.5 * longest_edge, walls)
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
+    normal = unit_rows(function.sample(corner.reshape(-1, 3)).gradient).reshape(-1, 3, 3)
     rows = np.flatnonzero(np.abs(np.linalg.det(normal)) > _INDEPENDENT)
     # The planes n_k . p = offset_k, with p relative to the center.
     offsets = (normal * (corner - center[:, None])).sum(axis=2)
@@ -274,7 +286,7 @@ def _level_along(
         The first crossing (k, 3) of the level on each segment; and the mask (k,) of the segments
         that cross the level. If a segment does not cross it, its point has no meaning.
     """
-    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
+    along = limited_rows(along, limit)
     low, high = np.zeros(len(start)), np.full(len(start), _SEARCH_LENGTH)
     is_found = np.ones(len(start), np.bool_)
     fractions = np.linspace(0, 1, _SAMPLES)
@@ -391,8 +403,7 @@ def _normals_turn(function: LevelFunction, corner: FloatArray) -> BoolArray:
 
     function: f - level for a field f; it is 0 on the level set.
     corner: (k, 3, 3) the corners of the faces."""
-    gradient = function.sample(corner.reshape(-1, 3)).gradient
-    normal = (gradient / np.maximum(row_norms(gradient), 1e-300)[:, None]).reshape(-1, 3, 3)
+    normal = unit_rows(function.sample(corner.reshape(-1, 3)).gradient).reshape(-1, 3, 3)
     cosines = [row_dots(normal[:, k], normal[:, k - 1]) for k in range(3)]
     return np.min(cosines, axis=0) < math.cos(_CREASE)
 
@@ -407,6 +418,13 @@ def _edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """
     edges = Edges.of(half_edges(faces))
     return edges.vertices, edges.edge_of_pair.reshape(3, -1).T, edges.multiplicity == 1
+
+
+def fan_faces(faces: IntArray, centers: IntArray) -> IntArray:
+    """Divide each of the faces (k, 3) into a fan of three around a new vertex in its interior.
+    Returns the faces (3k, 3). centers: (k,) the indices of the new vertices."""
+    a, b, c = faces.T
+    return np.concatenate([np.stack([*ends, centers], 1) for ends in ((a, b), (b, c), (c, a))])
 
 
 def split_faces(vertices: FloatArray, faces: IntArray, middle: IntArray) -> IntArray:

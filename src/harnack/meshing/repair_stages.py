@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from harnack.backend import IntArray
 from harnack.backend.validation import flag
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
@@ -36,15 +37,8 @@ from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.geometry.meshes import without_zero_area_faces
 from harnack.geometry.orientability import is_nonorientable
 from harnack.meshing.bodies import mended_by_cuts, united_parts
-from harnack.meshing.checks import (
-    MeshingError,
-    TriangleLimitError,
-    euler_characteristic,
-    intersecting_faces,
-    nonmanifold_vertices,
-)
-from harnack.meshing.clipping import Shells, component_facts, largest_body
-from harnack.meshing.edges import IntArray
+from harnack.meshing.checks import euler_characteristic, nonmanifold_vertices
+from harnack.meshing.components import Shells, component_facts, largest_body
 from harnack.meshing.finishing import check_options
 from harnack.meshing.harmonic_filling import (
     HarmonicFilling,
@@ -55,10 +49,12 @@ from harnack.meshing.harmonic_filling import (
 from harnack.meshing.hole_filling import fill_holes, hole_loops
 from harnack.meshing.intended_solid import Difference, IntendedSolid
 from harnack.meshing.joined_pieces import passes_itself
-from harnack.meshing.lattice_meshing import TriangleMesh
 from harnack.meshing.mesh_cleaning import CleanedMesh, clean_and_fill, weld_near_corners
 from harnack.meshing.mesh_pipeline import mesh as mesh_of
 from harnack.meshing.mesh_tolerance import MeshTolerance
+from harnack.meshing.meshing_errors import MeshingError, TriangleLimitError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.name_suggestions import is_one_of
 from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer.trace_options import trace_options

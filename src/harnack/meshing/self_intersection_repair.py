@@ -15,27 +15,25 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.checks import (
-    SelfIntersectionError,
-    check_no_self_intersection,
-    intersecting_faces,
-)
-from harnack.meshing.edges import (
-    IntArray,
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     area_normals,
     distance_from_triangles,
     edge_keys,
     half_edges,
+    has_distinct_corners,
     row_dots,
     row_norms,
     sorted_unique,
 )
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.neighborhoods import connected_groups
+from harnack.meshing.checks import check_no_self_intersection
+from harnack.meshing.meshing_errors import SelfIntersectionError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 
@@ -119,18 +117,12 @@ def _regions(
     Yields: For each neighborhood the indices of its faces; and the indices of the vertices that may
     be removed, which are the corners of near faces. If only these are removed, the new faces lie
     within the bounding box, so they cross no face outside of the neighborhood."""
-    import scipy.sparse  # imported here: it takes half a second
-    import scipy.sparse.csgraph as csgraph_module
-
-    sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     corner = vertices[faces]
     lower, upper = corner.min(axis=1), corner.max(axis=1)
     # Two rings of faces around the crossing ones. Each connected part begins a neighborhood.
     near = _faces_at_corners(faces, faces[crossing])
     second_ring = _faces_at_corners(faces, faces[near])
-    edges = half_edges(faces[second_ring])
-    adjacency = sparse.coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2)
-    component_of_vertex = csgraph.connected_components(adjacency, directed=False)[1]
+    component_of_vertex = connected_groups(half_edges(faces[second_ring]), len(vertices))
     neighborhoods: list[IntArray] = []
     for component in np.unique(component_of_vertex[faces[second_ring, 0]]):
         rows = second_ring[component_of_vertex[faces[second_ring, 0]] == component]
@@ -212,7 +204,7 @@ class _Neighborhood:
         old_rows = self.around(a)
         new_faces = np.where(self.faces[old_rows] == a, b, self.faces[old_rows])
         # Faces of which two corners are now the same vanish.
-        return old_rows, new_faces[(new_faces != np.roll(new_faces, 1, axis=1)).all(axis=1)]
+        return old_rows, new_faces[has_distinct_corners(new_faces)]
 
     def flip_edge(self, a: int, b: int) -> tuple[IntArray, IntArray] | None:
         """Replace the edge between the vertices a and b by the edge between the two corners

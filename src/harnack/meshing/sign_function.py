@@ -33,9 +33,9 @@ from harnack.fields.solid_angles.dipole import DipolePotential
 from harnack.fields.solid_angles.winding_number import WindingModuloOne, WindingNumber
 from harnack.geometry.clouds import build_point_tree
 from harnack.geometry.denoising import outlier_indices
-from harnack.meshing.checks import MeshingError
-from harnack.meshing.edges import row_dots, row_norms
+from harnack.geometry.mesh_edges import row_dots, row_norms, unit_rows
 from harnack.meshing.level_function import LevelFunction, LevelSamples
+from harnack.meshing.meshing_errors import MeshingError
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
@@ -241,7 +241,7 @@ class SignFunction(LevelFunction):
         normal[smooth_rows] = self._slopes(x[smooth_rows], direction[smooth_rows])
         is_falling = is_on_jump & (row_dots(normal, direction) < 0)
         normal[is_falling] *= -1
-        return x, normal / np.maximum(row_norms(normal), 1e-300)[:, None]
+        return x, unit_rows(normal)
 
     def _slopes(self, x: FloatArray, direction: FloatArray) -> FloatArray:
         """(n, 3) gradients of the function at points x (n, 3).

@@ -23,39 +23,41 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray
-from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
-from harnack.meshing.checks import (
-    EmptySurfaceError,
-    LocalizedMeshingError,
-    MeshingError,
-    check_triangle_limit,
-    intersecting_faces,
-    points_off_level,
-)
-from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
-from harnack.meshing.delaunay_points import TetrahedronPoints
-from harnack.meshing.edges import (
+from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.geometry.mesh_edges import (
     Edges,
-    IntArray,
     area_normals,
     boundary_edges,
     half_edges,
+    limited_rows,
+    longest_edges,
     row_dots,
     row_norms,
+    unit_normals,
 )
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.geometry.neighborhoods import kd_tree
+from harnack.meshing.bcc_lattice import BccLattice, distinct_rows
+from harnack.meshing.checks import check_triangle_limit, points_off_level
+from harnack.meshing.closed_mesh import from_manifold, to_manifold, without_short_edges
+from harnack.meshing.delaunay_points import TetrahedronPoints
 from harnack.meshing.level_function import LevelSamples
 from harnack.meshing.lost_parts import LostParts, PointsOnLevel
 from harnack.meshing.marching_tetrahedra import Tetrahedra, count_crossings, extract_triangles
-from harnack.meshing.refinement import split_faces
+from harnack.meshing.meshing_errors import (
+    CELL_SIZE_RATIO,
+    EmptySurfaceError,
+    LocalizedMeshingError,
+    MeshingError,
+)
+from harnack.meshing.refinement import cuts_off_crease, split_faces
+from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.sign_function import SignFunction
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 __all__ = [
-    "CELL_REFINEMENT_FACTOR",
     "MAX_OFF_LEVEL_FRACTION",
     "SignIsosurface",
     "extract_from_signs",
@@ -80,9 +82,8 @@ _SIMPLIFY_TOLERANCE, _SIMPLIFY_CELL_FRACTION = 0.5, 0.05
 _SHORTEST = 4.0
 # An edge is cut no nearer to its ends than this, relative to its length.
 _FROM_CORNERS = 0.1
-# Across a crease normals turn by at least this angle; and by this fraction of the angle between the
-# point on the crease and one of the ends of the edge.
-_MIN_CREASE_ANGLE, _CREASE_ANGLE_SHARE = math.radians(2), 0.75
+# Across a crease normals turn by more than this angle.
+_MIN_CREASE_ANGLE = math.radians(2)
 # The level set is searched for on the line from an edge to the point where tangent planes meet. The
 # search begins before the edge and ends after that point, by the first and up to the second of the
 # displacement between them. The displacement is clamped to the third, in lengths of the edge.
@@ -92,8 +93,8 @@ _BEFORE, _AFTER, _OFFSET = 0.3, 1.3, 1.0
 # second.
 _MIN_SQUARE, _INDEPENDENT = 1e-4, 0.1
 # The largest fraction of vertices and centers that may be beyond the tolerance before cells are
-# made smaller; and the ratio of smaller cells to the cells before.
-MAX_OFF_LEVEL_FRACTION, CELL_REFINEMENT_FACTOR = 0.01, 0.6
+# made smaller.
+MAX_OFF_LEVEL_FRACTION = 0.01
 # The largest distance from the level, in cells, that is measured.
 _MAX_DISTANCE_CELLS = 4.0
 # The largest number of triangles at whose corners and centers distances are measured.
@@ -186,14 +187,14 @@ def mesh_from_signs(
         lost = LostParts.of(function, level_points, mesh.surface, tolerance, spacing)
         attempts -= 1
         may_help = far_count > MAX_OFF_LEVEL_FRACTION * measured_count or (
-            lost.matter and lost.are_mended_by(CELL_REFINEMENT_FACTOR)
+            lost.matter and lost.are_mended_by(CELL_SIZE_RATIO)
         )
         if attempts <= 0 or not may_help or len(mesh.surface.faces) > _MOST_REMADE:
             break
         report(f"{far_count:,} of {measured_count:,} vertices and centers are beyond the tolerance")
         if lost.matter:
             report(str(lost))
-        spacing *= CELL_REFINEMENT_FACTOR
+        spacing *= CELL_SIZE_RATIO
     facts = {
         "made_by": "signs",
         "spacing": spacing,
@@ -423,15 +424,12 @@ def _collapse_slivers(
         was checked that no triangles intersect. (Triangles of an unchanged mesh do not intersect,
         up to rounding, since they lie in different tetrahedra.)
     """
-    import scipy.spatial  # imported here: it takes half a second
-
-    searching: Any = scipy.spatial
     x, faces = raw.vertices, raw.faces
     if len(boundary_edges(faces)):
         return x, faces, raw.normals, False
     simplified = from_manifold(without_short_edges(to_manifold(TriangleMesh(x, faces)), tolerance))
     # Vertices are only removed, never moved: each is one of the given ones, with its normal.
-    distances, nearest = searching.cKDTree(x).query(simplified.vertices)
+    distances, nearest = kd_tree(x).query(simplified.vertices)
     if not len(simplified.faces) or distances.any():
         return x, faces, raw.normals, False
     if len(intersecting_faces(simplified.vertices, simplified.faces)):
@@ -579,17 +577,8 @@ class _CreaseRefinement:
         ends = all_edges.vertices[rows]
         vertex_of_edge = np.full(len(all_edges.vertices), -1, np.int64)
         vertex_of_edge[rows] = len(x) + np.arange(len(rows))
-        # Two angles for each split edge: between the normals at its ends; and the larger one
-        # between the normal at the new vertex and that at an end.
-        angle_of_ends, angle_to_end = (
-            np.arccos(np.clip(cosine, -1, 1))
-            for cosine in (
-                row_dots(normals[ends[:, 0]], normals[ends[:, 1]]),
-                np.minimum(*(row_dots(normals[ends[:, k]], new_normal) for k in (0, 1))),
-            )
-        )
-        is_on_crease = (angle_of_ends > _MIN_CREASE_ANGLE) & (
-            angle_to_end > _CREASE_ANGLE_SHARE * angle_of_ends
+        is_on_crease = cuts_off_crease(
+            normals[ends[:, 0]], normals[ends[:, 1]], new_normal, _MIN_CREASE_ANGLE
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
@@ -674,7 +663,7 @@ def _level_along(
         (k,) of the segments that have such a point: the function has different signs at the two
         ends of the search. For other segments, point and normal have no meaning.
     """
-    along = along * np.minimum(1, limit / np.maximum(row_norms(along), 1e-300))[:, None]
+    along = limited_rows(along, limit)
     begin, end = start - _BEFORE * along, start + _AFTER * along
     is_positive = function.values(begin) > 0
     changes_sign = is_positive != (function.values(end) > 0)
@@ -714,12 +703,13 @@ def _crease_corners(
     independent = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
     rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
-    longest = np.stack([row_norms(corner[:, k] - corner[:, k - 1]) for k in range(3)]).max(axis=0)
     # The common point p of the planes n_k . (p - corner_k) = 0, relative to the center.
     offsets = np.einsum("kij,kij->ki", normal, corner - center[:, None])
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal, offsets[:, :, None])[:, :, 0]
-    points, new_normals, is_found = _level_along(function, center, direction, _OFFSET * longest)
+    points, new_normals, is_found = _level_along(
+        function, center, direction, _OFFSET * longest_edges(corner)
+    )
     return points[is_found], new_normals[is_found], rows[is_found]
 
 
@@ -779,8 +769,7 @@ def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     """The indices of the faces that are folded onto a neighbor (a face with a common edge), up to
     rounding: the normals of both are opposite. A pair of neighbors is tested if the mask `among`
     (m,) is set for at least one of the two."""
-    normal = area_normals(x[faces])
-    normal /= np.maximum(row_norms(normal), 1e-300)[:, None]
+    normal = unit_normals(x[faces])
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
     is_folded = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])

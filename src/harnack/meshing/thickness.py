@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, choose_backend, to_numpy, to_vector3
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
-from harnack.meshing.edges import IntArray, area_normals, row_dots, row_norms
+from harnack.geometry.mesh_edges import area_normals, row_dots, row_norms
 from harnack.meshing.mesh_pipeline import mesh
 from harnack.tracer import trace
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.thread import Thread
-from harnack.meshing.checks import MeshingError
 from harnack.meshing.closed_mesh import to_manifold
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold

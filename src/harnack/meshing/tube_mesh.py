@@ -15,10 +15,11 @@ import numpy as np
 
 from harnack.backend import FloatArray, IntArray
 from harnack.fields.solids.tube import Tube
-from harnack.meshing.checks import MeshingError, intersecting_faces
+from harnack.geometry.mesh_edges import has_distinct_corners, row_norms
 from harnack.meshing.closed_mesh import to_manifold
-from harnack.meshing.edges import row_norms
-from harnack.meshing.lattice_meshing import TriangleMesh
+from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
@@ -247,7 +248,7 @@ class _Sweep:
             vertex[[0, -1]] = vertex[[0, -1], :1]
         corners = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
         faces: IntArray = vertex.ravel()[corners]
-        is_triangle = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        is_triangle = has_distinct_corners(faces)
         return TriangleMesh.without_unused_vertices(rings.reshape(-1, 3), faces[is_triangle])
 
     def _transported(

@@ -18,7 +18,7 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.tube import Tube
 from harnack.geometry.meshes import MeshError, without_zero_area_faces
 from harnack.meshing import mesh
-from harnack.meshing.checks import MeshingError
+from harnack.meshing.meshing_errors import MeshingError
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.option_table import names_of
 from harnack.rendering.stage import Material, StudioObject, parse_material

@@ -11,13 +11,14 @@ piece lies as a whole either on the boundary of the set, or off it.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from harnack.backend import BoolArray, FloatArray, IntArray, to_numpy, to_vector3
 from harnack.backend.arrays import upload_integers
+from harnack.geometry.flat_lists import ranks_in_lists
 from harnack.tree.coplanar import borders_of_overlaps
 from harnack.tree.triangle_tree import NO_TRIANGLE, RayFrame, TriangleTree
 
@@ -158,18 +159,11 @@ def _crossing_faces(
     crossing_edge, crossed_face = _crossings_of_edges(tree, vertices, faces, edges)
     # For each crossing, all faces at the edge, each paired with the crossed face.
     count = edge_start[crossing_edge + 1] - edge_start[crossing_edge]
-    places = np.repeat(edge_start[crossing_edge], count) + _ranks_in_groups(count)
+    places = np.repeat(edge_start[crossing_edge], count) + ranks_in_lists(count)
     passing, passed = faces_by_edge[places], np.repeat(crossed_face, count)
     pairs = np.concatenate([np.column_stack([passing, passed]), np.column_stack([passed, passing])])
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     return pairs[:, 0], pairs[:, 1]
-
-
-def _ranks_in_groups(count: IntArray) -> IntArray:
-    """For each number n in `count` in turn, the numbers 0, 1, ..., n - 1, all concatenated. For
-    example, (2, 3) gives (0, 1, 0, 1, 2)."""
-    first = np.cumsum(count) - count
-    return cast("IntArray", np.arange(int(count.sum())) - np.repeat(first, count))
 
 
 def _crossings_of_edges(

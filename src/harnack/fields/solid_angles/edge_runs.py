@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.geometry.flat_lists import ranks_in_lists
+
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
 
@@ -278,8 +280,7 @@ def _merged(groups: list[CellEdges]) -> CellEdges:
     next_slot = np.cumsum(total) - total
     start, end, cell = np.empty((3, int(total.sum())), np.int64)
     for group, count in zip(groups, counts, strict=True):
-        rank = np.arange(len(group.cell)) - np.repeat(np.cumsum(count) - count, count)
-        slot = np.repeat(next_slot, count) + rank
+        slot = np.repeat(next_slot, count) + ranks_in_lists(count)
         start[slot], end[slot], cell[slot] = group.start, group.end, group.cell
         next_slot = next_slot + count
     return CellEdges(start, end, cell)

@@ -40,6 +40,7 @@ from harnack.fields.samples import RaySample, Sample
 from harnack.fields.solids.solid import Solid, box_around, set_frozen
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES, LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
+from harnack.geometry.mesh_edges import area_normals
 from harnack.geometry.orientability import is_nonorientable
 from harnack.geometry.welding import Welded
 from harnack.tree import build_balanced_tree
@@ -730,7 +731,7 @@ def _is_closed(pieces: FloatArray, jump: FloatArray, is_thick: BoolArray) -> boo
     are not thick may count or not, so their area is a tolerance.
     """
     # The integral of n over each piece; `moment` is the sum of the integrals of x_i n_j.
-    normal_integral = 0.5 * np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
+    normal_integral = 0.5 * area_normals(pieces)
     piece_area = np.linalg.norm(normal_integral, axis=1)
     normal_integral = normal_integral / np.maximum(jump, 1)[:, None]
     moment = np.einsum("ki,kj->ij", pieces.mean(axis=1), normal_integral)

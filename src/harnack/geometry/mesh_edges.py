@@ -1,7 +1,7 @@
-"""Edges of triangles and tetrahedra; products and norms of rows; normals of triangles, and
-distances from triangles. A pair is a row (a, b) of two indices of points, and the pairs (a, b) and
-(b, a) are the same edge. Faces (m, 3) hold the indices of the corners of triangles. A half-edge is
-an edge of a face in the direction in which the face runs it.
+"""Edges of triangles and tetrahedra; products, norms and directions of rows; normals of triangles,
+and distances from triangles. A pair is a row (a, b) of two indices of points, and the pairs (a, b)
+and (b, a) are the same edge. Faces (m, 3) hold the indices of the corners of triangles. A half-edge
+is an edge of a face in the direction in which the face runs it.
 
 `row_dots` and `row_norms` are here because numpy's own sums along an axis of length three are slow.
 """
@@ -11,24 +11,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from harnack.backend import FloatArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 
 __all__ = [
     "Edges",
-    "IntArray",
     "area_normals",
     "boundary_edges",
     "distance_from_triangles",
     "distances_from_triangles",
     "edge_keys",
     "half_edges",
+    "has_distinct_corners",
+    "limited_rows",
+    "longest_edges",
+    "normals_at_vertices",
     "row_dots",
     "row_norms",
+    "shortest_edges_at_vertices",
     "sorted_unique",
     "unique_with_inverse",
+    "unit_normals",
+    "unit_rows",
 ]
+
+# Divisors are at least this, so that nothing is divided by 0.
+_TINY = 1e-300
 
 
 def row_dots(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -47,7 +55,43 @@ def row_norms(vectors: FloatArray) -> FloatArray:
     return np.sqrt(row_dots(vectors, vectors))
 
 
-IntArray = npt.NDArray[np.int64]
+def unit_rows(vectors: FloatArray) -> FloatArray:
+    """The vectors (n, 3) divided by their lengths; vectors of length 0 stay as they are."""
+    return vectors / np.maximum(row_norms(vectors), _TINY)[:, None]
+
+
+def limited_rows(vectors: FloatArray, max_length: FloatArray) -> FloatArray:
+    """The vectors (n, 3), of which those longer than `max_length` (n,) are shortened to that."""
+    return vectors * np.minimum(1, max_length / np.maximum(row_norms(vectors), _TINY))[:, None]
+
+
+def unit_normals(corners: FloatArray) -> FloatArray:
+    """Unit normals (m, 3) of triangles with corners (m, 3, 3), by the right-hand rule; 0 for
+    triangles without an area."""
+    return unit_rows(area_normals(corners))
+
+
+def normals_at_vertices(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """For each of the vertices (n, 3) the sum (n, 3) of the `area_normals` of the faces there."""
+    normals, sums = area_normals(vertices[faces]), np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(sums, faces[:, k], normals)
+    return sums
+
+
+def shortest_edges_at_vertices(vertices: FloatArray, faces: IntArray) -> FloatArray:
+    """For each of the vertices (n, 3) the length (n,) of the shortest edge of the faces there; inf
+    for vertices without a face."""
+    corners, lengths = vertices[faces], np.full(len(vertices), np.inf)
+    shortest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
+    for k in range(3):
+        np.minimum.at(lengths, faces[:, k], shortest)
+    return lengths
+
+
+def longest_edges(corners: FloatArray) -> FloatArray:
+    """The length (m,) of the longest edge of each triangle with corners (m, 3, 3)."""
+    return np.max([row_norms(corners[:, k] - corners[:, k - 1]) for k in range(3)], axis=0)
 
 
 def distance_from_triangles(point: FloatArray, corner: FloatArray) -> float:
@@ -64,13 +108,13 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
     distance = np.full(len(corner), np.inf)
     for k in range(3):
         start, edge = corner[:, k], corner[:, k - 1] - corner[:, k]
-        fraction = row_dots(points - start, edge) / np.maximum(row_dots(edge, edge), 1e-300)
+        fraction = row_dots(points - start, edge) / np.maximum(row_dots(edge, edge), _TINY)
         foot = start + np.clip(fraction, 0, 1)[:, None] * edge
         distance = np.minimum(distance, row_norms(points - foot))
     normal = area_normals(corner)
     size = row_norms(normal)
     is_within = size > 0  # a triangle without an area has edges alone
-    size = np.maximum(size, 1e-300)
+    size = np.maximum(size, _TINY)
     # The foot of the perpendicular on the plane lies in the triangle if it is on the inner side of
     # all edges.
     height = row_dots(points - corner[:, 0], normal) / size
@@ -112,6 +156,17 @@ class Edges:
             -1, 2
         )
 
+    def run_twice_alike(self, pairs: IntArray) -> BoolArray:
+        """The mask (k,) of the edges that exactly two pairs are, both in the same direction. If the
+        pairs are the half-edges of faces, the two faces at such an edge do not agree which side of
+        the surface is which.
+
+        pairs: (n, 2) the pairs of which these are the edges.
+        """
+        directions = np.where(pairs[:, 0] < pairs[:, 1], 1, -1)
+        sums = np.bincount(self.edge_of_pair, directions, minlength=len(self.multiplicity))
+        return (self.multiplicity == 2) & (sums != 0)
+
 
 def edge_keys(pairs: IntArray, count: int) -> IntArray:
     """An integer (k,) for each pair (k, 2) of indices below `count`: the same for a pair and its
@@ -125,6 +180,11 @@ def half_edges(faces: IntArray) -> IntArray:
     indices of points. First come the edges of all faces from corner 0 to corner 1, then those from
     1 to 2, then those from 2 to 0. So row k m + i is edge k of face i."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def has_distinct_corners(faces: IntArray) -> BoolArray:
+    """(m,) whether the three corners of each of the faces (m, 3) are different vertices."""
+    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
 def boundary_edges(faces: IntArray) -> IntArray:
