@@ -180,6 +180,7 @@ class ClosestPointDescent:
         def is_active(*initial: Any) -> Mask:
             return initial[-1]
 
+        # No lane is lost or too far yet; the step before the first one counts as infinite.
         no_lane = mask(False)
         initial = vector(start), real(0), real(dr.inf), no_lane, mask(False), count(0), mask(True)
         final = dr.while_loop(initial, is_active, body, label="Newton's method")

@@ -528,6 +528,7 @@ class _QueryEvaluator:
             def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)
 
+            # (Radii of 0: no ball is proved.)
             return in_batches(self._tracer.backend, by_compass_search, points, start)[0], np.zeros(
                 len(points)
             )

@@ -147,7 +147,7 @@ def curvature(
         )
         return derivatives.curvatures()
 
-    return _refine_accuracy(backend, field, from_tree, points, True)
+    return _refine_accuracy(backend, field, from_tree, points, True)  # the treecode can refine
 
 
 def _refine_accuracy(
@@ -473,6 +473,7 @@ class _CurvatureLineTracer:
             )
 
         no_steps = dr.zeros(integer, 2 * n)
+        # (`& True` makes an array of its own for the loop.)
         loop_while_active(
             _LineState(x, direction, no_steps, is_known & True), body, "curvature lines"
         )
