@@ -198,6 +198,7 @@ def _deviations_by_normals(
     """
     is_similar = np.einsum("mi,mki->mk", normals, neighbor_normals) > _MIN_NORMAL_COSINE
     heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + neighbor_normals), offsets)
+    # At least 2, as count - 1 divides.
     count = np.maximum(is_similar.sum(axis=1), 2)
     mean = (heights * is_similar).sum(axis=1) / count
     return np.sqrt(((heights - mean[:, None]) ** 2 * is_similar).sum(axis=1) / (count - 1))
@@ -284,6 +285,7 @@ class CloudDenoiser:
             moved = _move_along_normals(
                 start, normals, neighbors, self.points, normals[nearest], normal_scale
             )
+        # Points are judged at their old places, where their neighbors were found.
         is_self = neighbors == self.selected[:, None]
         is_kept = (
             _agreeing_weight(
