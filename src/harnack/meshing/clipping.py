@@ -159,7 +159,8 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
         tri = rows[(number == 1) & is_out[mixed][:, k]][:, order]  # the first corner is outside
-        # Two corners inside: the part is a quadrilateral, two triangles.
+        # Two corners inside: the part is a quadrilateral, two triangles. p and q are the points at
+        # which the edges at the outer corner are cut.
         p, q = (crossing(tri[:, 1], tri[:, 0]), crossing(tri[:, 2], tri[:, 0]))
         pieces += [np.stack([tri[:, 1], tri[:, 2], p], axis=1), np.stack([tri[:, 2], q, p], axis=1)]
         tip = rows[(number == 2) & ~is_out[mixed][:, k]][:, order]  # the first corner is inside

@@ -190,6 +190,7 @@ class CsgMesher:
             manifold = method(self, solid, level) if isinstance(solid, kind) else None
             if manifold is not None:
                 return manifold
+        # [0]: the mesh.
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
@@ -391,6 +392,7 @@ class CsgMesher:
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
+        # The centers of all cells, whose lattice coordinates are odd.
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
@@ -467,6 +469,7 @@ class CsgMesher:
         if is_single_level_set(solid.field):
             return None
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
+        # The eight corners of this box.
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
         # The box around the preimage of this box. The map stretches lengths by at most `scale`.

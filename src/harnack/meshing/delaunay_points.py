@@ -203,6 +203,7 @@ def sample_delaunay_points(
     # Leaves of the octree are `occupied` (they may hold the level set) or proved `empty`.
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
+    # Large empty cells count as twice as large as the occupied ones at most.
     min_curve_distance = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, min_curve_distance, boundary)
     points, size = points[is_far], size[is_far]

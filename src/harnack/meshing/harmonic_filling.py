@@ -155,7 +155,7 @@ def _fill_all_holes(
     Raises:
         MeshingError: the filling could not be computed, or intersects the mesh or itself.
     """
-    if not len(edges):
+    if not len(edges):  # no hole: no vertices and no faces
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     # Each boundary edge counts once, in its direction.
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
@@ -442,6 +442,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
     """
     is_at_middle = (faces == middle).any(axis=1)
     faces_at_middle, others = faces[is_at_middle], faces[~is_at_middle]
+    # (number of intersecting faces, minus the smallest cosine of a turn, the new faces)
     candidates: list[tuple[int, float, IntArray]] = []
     for end in ends:
         at_end = (faces == end).any(axis=1)

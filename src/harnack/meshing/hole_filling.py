@@ -282,6 +282,7 @@ def _make_patches(
     the index of the loop that it helps to fill; and a dictionary from the indices of loops without
     a patch to the reasons, in words.
     """
+    # For each directed edge around the holes the third corner of its face.
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     used_edges = {(min(edge), max(edge)) for edge in third}
     fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
@@ -302,6 +303,7 @@ def _make_patches(
         patches.append(triangles)
     if not patches:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
+    # x has four columns: the coordinates, and the usual length of edges (`_refine_patches`).
     x, new = _refine_patches(vertices, faces, np.concatenate(patches), fixed_edges)
     # Without new vertices nothing can be moved. The last two rounds split no edges.
     for rounds_left in range(fairings if len(x) > len(vertices) else 0, 0, -1):
