@@ -371,6 +371,7 @@ def snap_to_level(
     points (n, 3); their samples; and a mask (n,) of those that may be used: the method converged,
     and moved the point by less than `max_distance` (n,).
 
+    function, points, samples, max_step, walls, steps: as in `newton_to_level`.
     size: (n,) the size of cells at the points, to which distances from the level set are compared.
     """
     moved = newton_to_level(function, points, samples, max_step, walls, steps)

@@ -223,6 +223,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         rows, side = np.flatnonzero(is_side_cut.any(axis=1)), is_side_cut.argmax(axis=1)
         side = side[rows]
         a, b, c = (faces[rows, (side + k) % 3] for k in range(3))
+        # The vertex at which the side from a to b is cut.
         p = vertex_on_edge[is_cut][position[rows, side]]
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]

@@ -395,8 +395,8 @@ def _roots(
     edges: (r,) the indices of the edges that have a crossing.
 
     The points are found by the secant method if the function has `secant_steps`, else by
-    Chandrupatla's method. If an end of an edge has the value `OUTSIDE_VALUE`, which stands for the
-    outside of the meshed region, the point is the middle of the edge."""
+    Chandrupatla's method. In the latter case, if an end of an edge has the value `OUTSIDE_VALUE`,
+    which stands for the outside of the meshed region, the point is the middle of the edge."""
     a, b = tets.ends[edges].T
     p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]

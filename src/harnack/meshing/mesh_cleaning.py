@@ -141,6 +141,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         candidates.append(
             (len(boundary_edges(welded_faces)) + lost_edges, mean, welded_faces, largest_move)
         )
+    # The candidate with the fewest open edges.
     count, mean, welded_faces, largest_move = min(candidates, key=lambda candidate: candidate[0])
     if count > _MAX_OPEN_RATIO * len(faces):
         raise MeshingError(
@@ -176,6 +177,7 @@ class _WorkingMesh:
         area = row_norms(area_normals(corner))
         # Three reasons in turn: faces without an area, duplicates, and faces that intersect others.
         rows = all_faces[area > 0]
+        # The last four are for faces that are removed later.
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
         _, first_of_duplicates = np.unique(

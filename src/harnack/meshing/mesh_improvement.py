@@ -157,6 +157,7 @@ def _flips_stay_near(
     middle = corner[:, 0, :2].mean(axis=1)
     points = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
     samples = function.sample(points)
+    # Three samples for each flip: at the middle, then at both centers, whose gradients count.
     is_near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     gradient = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(gradient, axis=2)

@@ -384,6 +384,7 @@ def _mesh_from_signs(
             # The box itself has cut the mesh already if the clip is a box.
             made, is_intersection_free = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
+        # Reversed, the faces look out of the solid of larger values.
         made = signed(levels[0], -1.0, False)
     else:
         # Between two levels: the points below the upper level without those below the lower one.
@@ -670,6 +671,7 @@ def _mesh_solid(
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            # In a single attempt: the caller tries again with smaller cells.
             made, facts = _mesh_spanning_curve(
                 function, box, error, cells, 1, asked.seed, asked.report
             )
@@ -850,14 +852,15 @@ class _MeshingBox:
 
 def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
     """Whether the points outside of `box` belong to the solid in which f lies between two levels.
+    The box contains both level sets. So either all points outside belong to the solid or none does,
+    and the value of f at one of them decides. False if no such point is in the field's domain.
 
-    ends: the two levels. The box contains both level sets. So either all points outside belong to
-        the solid or none does, and the value of f at one of them decides. False if no such point is
-        in the field's domain."""
+    ends: the two levels."""
     center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
     # Points around the box: its corners and the centers of its edges and faces, moved outwards.
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
     signs = signs[signs.any(axis=1)]
+    # First points well outside; then, as these may be outside of the domain, points nearby.
     points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
     if field.domain is not None:
         points = points[field.domain.contains_points(points)]
