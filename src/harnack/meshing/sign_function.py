@@ -232,9 +232,11 @@ class SignFunction(LevelFunction):
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
             t, normal, is_on_jump = self._on_sheets(low, direction, first, last)
+            # The shortened segments need two evaluations only.
             rows = np.flatnonzero(~is_on_jump)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
+            # On the whole segments, from 0 to 1.
             t = self._roots(low, direction, t, t + 1, _MAX_EVALUATIONS)
         x = low + t[:, None] * direction
         smooth_rows = np.flatnonzero(~is_on_jump)
@@ -340,6 +342,7 @@ class SignFunction(LevelFunction):
             """The t and the normal of the first crossing of a jump surface along rays o + t d, for
             t up to limit.x; t is infinite if there is none."""
             zero = backend.Array3f(0)
+            # The place t = 0 of the ray, on no facet.
             ray_start = JumpCrossing(
                 backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), zero
             )

@@ -239,7 +239,7 @@ def _distances(
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
-    # Every k-th face, with the smallest k for which at most 20,000 are left.
+    # Every k-th face, with the smallest k for which at most 20,000 are left (1 without faces).
     surface = TriangleMesh.without_unused_vertices(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
@@ -487,7 +487,7 @@ def _triangles(
     tetrahedra = Tetrahedra.of(points, corners[(positive_count > 0) & (positive_count < 4)])
     if not len(tetrahedra.corners):
         return points[:0], np.zeros((0, 3), np.int64)
-    # A value of 0 counts as below; no point is on the level.
+    # A value of 0 counts as below; no point is on the level. Gradients and radii are not used.
     is_on_level = np.zeros(len(points), np.bool_)
     sampled = TetrahedronPoints(
         points, is_on_level, LevelSamples(value, np.zeros_like(points), value)
@@ -745,7 +745,7 @@ def _undo_until_valid(
         x[faces[is_turned]] = unmoved[faces[is_turned]]
         undone_count += int(is_turned.sum())
     is_tested: BoolArray = np.asarray((x != unmoved).any(axis=1)[faces].any(axis=1))
-    failing = faces[:0, 0]
+    failing = faces[:0, 0]  # no indices
     for _ in range(_MOST_REPAIRS):
         failing = np.union1d(
             intersecting_faces(x, faces, is_tested), _folded_faces(x, faces, is_tested)

@@ -90,6 +90,7 @@ def _vertices(
     then the points at angle 0 of the `shift` lines above the last one, where the last lines end
     after a turn."""
     angle = 2 * math.pi * np.arange(segments) / segments
+    # The height and the radius of the last lines after a turn, where they are at angle 0 again.
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
     x, y = radii[:, None] * np.cos(angle), radii[:, None] * np.sin(angle)
