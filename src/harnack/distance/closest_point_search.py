@@ -678,6 +678,7 @@ class _QueryEvaluator:
         descent does not end on the level; and the radius of a ball about it in which no surface
         point is nearer to p, 0 if the descent does not converge."""
         y, is_converged, on_level = self._descent.descend(p, start)
+        # The radius is the third result of `finish`.
         return dr.select(on_level, y, dr.nan), dr.select(
             is_converged, self._descent.finish(p, y)[2], 0
         )

@@ -141,7 +141,7 @@ def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) ->
     """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
-    noise = NoiseEstimate(0.0, 1.0)
+    noise = NoiseEstimate(0.0, 1.0)  # replaced in the loop
     for count in _COUNTS:
         index, distance = nearest_neighbors(tree, points[probes], count)
         offsets = points[index] - points[probes, None]
@@ -273,7 +273,7 @@ class CloudDenoiser:
             adjacent = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
         else:
             tree = build_point_tree(start)
-            nearest = _neighbors(tree, self.points, 1)[:, 0]
+            nearest = _neighbors(tree, self.points, 1)[:, 0]  # a single neighbor
             adjacent = _neighbors(tree, start, _INITIAL_NEIGHBORS)
             start = _move_along_normals(start, normals, adjacent, start, normals, normal_scale)
         neighbors = _neighbors(self.tree, start, self.noise.neighbor_count)

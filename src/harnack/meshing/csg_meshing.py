@@ -198,9 +198,9 @@ class CsgMesher:
         factored out and operands that cancel were dropped."""
         from manifold3d import Manifold
 
-        apart = factor_common_operands(solid, level) if solid.is_union else None
-        if apart is not None:
-            return self.mesh_sublevel(apart, 0.0)
+        factored = factor_common_operands(solid, level) if solid.is_union else None
+        if factored is not None:
+            return self.mesh_sublevel(factored, 0.0)  # its level is 0
         reduced = drop_cancelled_operands(flatten_csg(solid), level)
         return Manifold() if reduced is None else self._combine_operands(reduced, level)
 
@@ -934,5 +934,6 @@ def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     vertices = surface.vertices
     for box in boxes:
         if isinstance(box, Box):
+            # (Within 1e-12 of the plane's coordinate.)
             vertices = snap_to_box(np.clip(vertices, *box.bounds()), box, 1e-12)
     return TriangleMesh(vertices, surface.faces)

@@ -440,6 +440,7 @@ def to_multiple_roots(
     """
     x = points
     for k in range(_SERIES_STEPS):
+        # Two single steps, without walls (None).
         once = newton_to_level(
             function, x, samples if k == 0 else function.sample(x), max_step, None, steps=1
         )

@@ -391,6 +391,7 @@ def _refine_patches(
             surface.
     """
     failed = x[:0]
+    # (None: there are no walls.)
     for mode in ("improving", "smoothing", "refining alone"):
         report(mode)
         new_vertices, new_faces = (
@@ -464,6 +465,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
+    # The new faces of the best candidate.
     return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 

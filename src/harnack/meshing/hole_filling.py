@@ -171,6 +171,7 @@ def _failure_reasons(
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
     crossing = intersecting_faces(x, together, is_new)
+    # Of these, the faces of patches, as indices of `new`.
     reasons |= dict.fromkeys(
         owner[crossing[is_new[crossing]] - len(faces)].tolist(), "passing through other triangles"
     )

@@ -125,7 +125,7 @@ def isotopy_of(
         if it does not end there.
     """
     corners = points.points[tetrahedra]
-    if not _has_bounds(function, corners[is_cut]):
+    if not _has_bounds(function, corners[is_cut]):  # nothing is proved, anywhere
         return IsotopyCoverage(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
     # Tetrahedra that count: those that the mesh meets, and those not proved to satisfy (a).
     uncut = np.flatnonzero(~is_cut)

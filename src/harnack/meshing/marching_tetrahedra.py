@@ -169,6 +169,7 @@ def count_crossings(
     change = np.where(has_free_ends, value[b] - value[a], 0.0)
     if function.period is None:
         count = np.where(has_free_ends, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
+        # All edges count as proved, and none is integrated.
         return EdgeCrossings(count, change, int(has_free_ends.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)

@@ -491,6 +491,7 @@ def _faces_alone(
         )
     facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
+    # No check of the level: the triangles are the level set. Other checks follow (False).
     return _RawMesh(surface, size, facts, function, _accept, False)
 
 
@@ -708,6 +709,7 @@ def _mesh_solid(
         "evaluations": made.evaluations + angle_evaluations[0],
         "surfaces_with_options": made.levels,
     }
+    # (True: `mesh_solid` has checked it.)
     return _RawMesh(
         made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
     )
@@ -752,6 +754,7 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
         volume."""
         _check_level(function, surface, asked.tolerance.at(size), volume)
 
+    # (False: it is checked later, after it was cut and perhaps thickened.)
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 
 
@@ -782,6 +785,7 @@ def _mesh_in_lattice(
             lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
             made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
             check_manifold(made.faces, made.vertices)
+            # (None: no volume has cut the mesh yet.)
             check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
             check_no_self_intersection(made.vertices, made.faces)
             break
@@ -883,7 +887,7 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
             f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
             "choose the other side, or give a clip with bounds, such as a box"
         )
-    return _MeshingBox(*bounds, True)
+    return _MeshingBox(*bounds, True)  # the surface may end at its faces
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
@@ -949,7 +953,7 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give a box or a ball")
     pad = _CURVE_MARGIN * (upper - lower).max()
-    return _MeshingBox(lower - pad, upper + pad, True)
+    return _MeshingBox(lower - pad, upper + pad, True)  # the surface may end at its faces
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:

@@ -369,6 +369,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     Raises:
         MeshingError: normals face inwards, cancel each other, or the points lie in a plane.
     """
+    # `is_estimated` tells whether normals, and whether areas, were estimated.
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
     # The values at every step-th point, at most 2000 of them.

@@ -244,6 +244,7 @@ def _distances(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
+    # (None: no volume has cut the mesh.)
     off_level, measured_count = points_off_level(function, x, faces, tolerance, None)
     # Double the distance until no point is farther.
     within, farther = tolerance, off_level

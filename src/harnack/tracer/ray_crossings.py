@@ -148,6 +148,7 @@ def find_crossings(
         if tracer is None or now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
+            # The tracer's own state includes that of the march.
             walk = tracer.advance(now.sheets)
             next_state = _SearchState(None, walk, now.count)
             after, facet = tracer.finish(walk)
