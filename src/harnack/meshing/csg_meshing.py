@@ -678,6 +678,7 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
         return field, level
+    # The boundary of each solid made here is its level 0.
     low, high = solid_value_range(field, solid, level)
     if low == -math.inf:
         return solid_of(field, below=high), 0.0
@@ -804,6 +805,7 @@ def _check_and_mend(
     try:
         check(surface, size)
     except OffLevelError as error:
+        # (The mesher's tolerance is half of the whole one.)
         moved = project_outliers(
             mesher.function(solid, level), surface, error.locations, 2 * mesher.tolerance,
             lambda candidate: check(candidate, size),

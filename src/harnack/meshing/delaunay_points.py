@@ -159,20 +159,21 @@ def box_cells(
         times a power of two, which may reach beyond the box on all sides.
     """
     size = upper - lower
-    finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
-    # At first the longest side has up to 8 cells; the rest is left to halvings.
+    halvings = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
+    # At first the longest side has up to 8 = 2^3 cells; the rest is left to halvings.
     if exact:
-        edge = float(size.max()) / 2 ** min(finest, 3)
+        edge = float(size.max()) / 2 ** min(halvings, 3)
+        # (1 - 1e-9: rounding adds no cell.)
         counts = np.maximum(1, np.ceil(size / edge * (1 - 1e-9))).astype(int)
-        finest = max(0, math.ceil(math.log2(float((size / counts).max()) / spacing)))
+        halvings = max(0, math.ceil(math.log2(float((size / counts).max()) / spacing)))
         edges = size / counts
     else:
-        edge = spacing * 2.0 ** max(0, finest - 3)
+        edge = spacing * 2.0 ** max(0, halvings - 3)
         counts = np.maximum(1, np.ceil(size / edge)).astype(int)
         lower, edges = 0.5 * (lower + upper - counts * edge), np.full(3, edge)
-        finest = round(math.log2(edge / spacing))
+        halvings = round(math.log2(edge / spacing))
     grid = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    return BoxCells(lower + grid * edges, edges), finest
+    return BoxCells(lower + grid * edges, edges), halvings
 
 
 def sample_delaunay_points(

@@ -271,6 +271,7 @@ def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> In
     triangles = triangles[np.linalg.norm(_unit_normals(corners), axis=1) > 0]
     together = np.concatenate([faces, triangles])
     is_new = np.arange(len(together)) >= len(faces)
+    # Of the intersecting faces those that are new.
     intersecting = np.setdiff1d(
         intersecting_faces(vertices, together, is_new), np.arange(len(faces))
     )

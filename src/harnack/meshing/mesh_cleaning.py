@@ -100,6 +100,7 @@ def clean_and_fill(
         if not len(failing_vertices):
             return working.result(holes)
         working = working.without_ring(failing_vertices)
+        # Faces of fillings, which have no source, do not count.
         if (working.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
     raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")

@@ -254,6 +254,7 @@ class SignFunction(LevelFunction):
             return x
         self.evaluations += len(x)
         if isinstance(self.field, BatchedField) and self.field.jumps is None:
+            # [1]: the gradient.
             field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
             field_gradient = self.field.gradient(x, precision=self.precision)

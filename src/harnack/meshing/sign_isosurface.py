@@ -645,6 +645,7 @@ def _toward_tangent_planes(
         fraction = row_dots(point, across) / row_dots(across, across)
         fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
         foot = fraction[:, None] * edge
+        # From the point of the edge to the nearest point of the line.
         direction = point + row_dots(foot - point, axis)[:, None] * axis - foot
     is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
     return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), sine2
@@ -731,6 +732,7 @@ def _undo_until_valid(
     Raises:
         LocalizedMeshingError: triangles still intersect.
     """
+    # First faces that are turned over, then faces that intersect others or are folded onto them.
     x = x.copy()
     undone_count = 0
     unmoved_normals = area_normals(unmoved[faces])

@@ -106,6 +106,8 @@ def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int
     step: the angles, as numbers from 0 to `segments` (a full turn). Line i after a full turn is
         line i + shift at angle 0.
     lines, segments: the number of lines, and of the vertices of a line in one turn."""
+    # After a full turn a line is another one, at angle 0. The points of lines beyond the last come
+    # after those of all lines.
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 

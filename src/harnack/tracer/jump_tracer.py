@@ -307,6 +307,7 @@ class JumpTracer:
             is_same_point = (
                 now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | is_parallel)
             )
+            # Of the facets at which f jumps up (down), the first one is kept.
             new_up = is_same_point & (crossing.jump > 0) & (now.up == NO_FACET)
             new_down = is_same_point & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
