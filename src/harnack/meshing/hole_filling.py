@@ -379,7 +379,7 @@ def _min_area_triangulation(
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
-        return polygon[None]
+        return polygon[None]  # a single triangle, (1, 3)
     # An infinite cost excludes a diagonal; `+=` below keeps it.
     cost = np.where(_forbidden_diagonals(polygon, used_edges), np.inf, 0.0)
     apex = np.zeros((n, n), np.int64)
@@ -441,7 +441,7 @@ def _min_dihedral_triangulation(
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
-        return polygon[None]
+        return polygon[None]  # a single triangle, (1, 3)
     barred = _forbidden_diagonals(polygon, used_edges)
     beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
     for position in range(n):

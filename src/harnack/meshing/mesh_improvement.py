@@ -328,6 +328,7 @@ class _VertexStars:
         count: the number of all vertices of the mesh."""
         index = np.full(count, -1, np.int64)
         index[centers] = np.arange(len(centers))
+        # For each pair, the face and the place (0 to 2) of the vertex among its corners.
         face, column = np.nonzero(index[faces] >= 0)
         corners = np.stack([faces[face, (column + k) % 3] for k in range(3)], axis=1)
         return cls(centers, index[corners[:, 0]], face, corners)

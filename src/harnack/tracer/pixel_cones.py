@@ -199,6 +199,8 @@ class PixelCones:
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
         if self.bounding_balls is not None and self.prepared.volume is not None:
+            # Around `middle`, a ball of radius `depth` lies in the extent, and a ball of radius
+            # `size` contains it.
             middle, depth, size = self.bounding_balls
             # The distance at which a cone can be last near the extent, with a margin for its radius
             # there.
@@ -207,6 +209,7 @@ class PixelCones:
             o = (self.origin - middle) / factor + middle
             start, end = self.prepared.volume.clip(o, self.direction, start, end)
             start, end = start * factor, end * factor
+        # Outside of the region f must not be evaluated.
         if self.prepared.region is not None:
             start, end = self.prepared.region.clip(self.origin, self.direction, start, end)
         return real(start), real(end)
