@@ -393,6 +393,7 @@ class _CellRecord:
         vector from there to the surface point: so the distance follows by Pythagoras.
         """
         offset = x - self.surface_point
+        # A point of the clip curve has no plane.
         height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
         lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
         distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))

@@ -216,6 +216,7 @@ def _search_smooth_part(
     backend, surface = evaluator.backend, evaluator.surface
     smoothed = replace(surface, field=smooth).with_call_cache(begins=True)
     smooth_evaluator = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
+    # The last result: first-order estimates of the distances.
     estimate = smooth_evaluator.evaluate(points)[-1]
     result = search(
         smoothed,
