@@ -371,6 +371,7 @@ class CellClassifier:
         is_empty, cells.normal[is_inside], cells.offset[is_inside], cells.thickness[is_inside] = (
             self._at(self._slab, center[is_inside], _CUBE_CIRCUMRADIUS * half[is_inside])
         )
+        # `is_empty` has numbers, 1 or 0. Cells whose center is outside are kept.
         is_nonempty = np.ones(len(cells), np.bool_)
         is_nonempty[is_inside] = is_empty == 0
         return cells.select(is_nonempty)
@@ -513,6 +514,7 @@ class CellClassifier:
         n = gradient / safe_norm(gradient)
         # A cell without a slab gets the tangent plane at its surface point.
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
+        # Up to the far side of the ball around the cell, if no boundary is nearer.
         plane_radius, boundary = radius + safe_norm(y - p), self._field.boundary
         if boundary is not None and boundary.closest_point is not None:
             plane_radius = fmin(plane_radius, safe_norm(boundary.closest_point(y) - y))
@@ -575,6 +577,7 @@ class CellClassifier:
             y = dr.select(
                 goes_on, dr.fma(vector(step / gradient_norm), sample.gradient + zero, y), y
             )
+            # Steps as short as this have converged.
             goes_on &= shrinks & (last > 1e-9 * radius)
             # The largest number of steps ends the loop.
             return y, last, dr.select(goes_on, k + 1, _MAX_SLOW_STEPS)

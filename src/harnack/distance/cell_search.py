@@ -533,6 +533,7 @@ class _CellSearch:
     def _descend_from_best_start(self, tree: CellTree) -> FloatArray:
         """Descend for each query from the surface point of the cell of the tree with the smallest
         estimated distance. Returns these surface points (n, 3), `FAR_SENTINEL` for none."""
+        # `slice(None)`: of all queries.
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
@@ -614,6 +615,7 @@ class _CellSearch:
     def _leave_boundary(self) -> IntArray:
         """Descend along the surface for each query whose best point lies on the curve at which the
         surface ends. Returns the indices of the queries whose distance became smaller."""
+        # `slice(None)`: among all queries.
         ids = np.flatnonzero(self._is_boundary(slice(None)))
         distance = self._distance(ids)
         ids, distance = ids[distance > 0], distance[distance > 0]

@@ -169,7 +169,8 @@ class CellTree:
         # The same for the clip curve and its tangent line.
         radius = _CLIP_CURVE_RADIUS * cells.half[clip_rows]
         bulge = radius * np.minimum(0.25, cells.clip_curvature[clip_rows] * radius)
-        # The records of clip points: another point, no slab, and the index -1.
+        # The records of clip points: another point at the places 4 to 6; other numbers from place
+        # 12 on, of which the first is the index -1. They keep the box and the slab of their cell.
         records[count:, 4:7] = cells.clip_point[clip_rows]
         records[count:, 12:] = np.column_stack([
             np.full(len(clip_rows), -1), radius, bulge,
@@ -178,7 +179,8 @@ class CellTree:
         center, half = cells.center[cell_of_record], cells.half[cell_of_record, None]
         hierarchy = build_balanced_tree(center, leaf_size=_LEAF_SIZE)
         slot_records = hierarchy.values_in_slots(records)
-        # Empty places of leaves get a record that is infinitely far away.
+        # Empty places of leaves get a record that is infinitely far away: no center and no point,
+        # no slab, the normal 0, and the index -1.
         slot_records[hierarchy.leaf_slots < 0] = (
             [FAR_SENTINEL] * 3 + [0] + [FAR_SENTINEL] * 4 + [0, 0, 0, 0, -1, 0, 0, 0]
         )
@@ -391,6 +393,7 @@ class _CellRecord:
         vector from there to the surface point: so the distance follows by Pythagoras.
         """
         offset = x - self.surface_point
+        # A point of the clip curve has no plane.
         height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
         lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
         distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))

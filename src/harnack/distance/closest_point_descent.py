@@ -180,6 +180,7 @@ class ClosestPointDescent:
         def is_active(*initial: Any) -> Mask:
             return initial[-1]
 
+        # No lane is lost or too far yet; the step before the first one counts as infinite.
         no_lane = mask(False)
         initial = vector(start), real(0), real(dr.inf), no_lane, mask(False), count(0), mask(True)
         final = dr.while_loop(initial, is_active, body, label="Newton's method")
@@ -349,6 +350,7 @@ class ClosestPointDescent:
         real = self.backend.Float
         scale = lengths.max_norm(y)
         epsilon, gradient_norm = self.backend.machine_epsilon, lengths.safe_norm(sample.gradient)
+        # With the rounding of f - level.
         total_error = dr.fma(8 * epsilon, dr.abs(sample.value), sample.value_error)
         # Rounding of coordinates, and of f divided by its slope.
         uncertainty = dr.fma(4 * epsilon, scale, total_error / gradient_norm)
@@ -437,8 +439,8 @@ class ClosestPointDescent:
             trial = trial.flat_after(is_flat, current)
             is_better = active & (is_first | (dr.abs(new_residual) < dr.abs(residual)))
             # The fraction of Newton's step that the next iteration tries.
-            step_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
-            factor = dr.select(is_first, factor, step_factor)
+            next_factor = dr.select(is_better, fmin(2 * factor, 1), 0.25 * factor)
+            factor = dr.select(is_first, factor, next_factor)
             on_level |= is_better & self._is_on_level(new_residual, trial)
             active &= ~on_level & (iteration <= _MAX_LEVEL_STEPS) & (factor > _MIN_STEP_FRACTION)
             residual = dr.select(is_better, new_residual, residual)

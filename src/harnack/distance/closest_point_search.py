@@ -216,6 +216,7 @@ def _search_smooth_part(
     backend, surface = evaluator.backend, evaluator.surface
     smoothed = replace(surface, field=smooth).with_call_cache(begins=True)
     smooth_evaluator = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
+    # The last result: first-order estimates of the distances.
     estimate = smooth_evaluator.evaluate(points)[-1]
     result = search(
         smoothed,
@@ -528,6 +529,7 @@ class _QueryEvaluator:
             def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)
 
+            # (Radii of 0: no ball is proved.)
             return in_batches(self._tracer.backend, by_compass_search, points, start)[0], np.zeros(
                 len(points)
             )
@@ -677,6 +679,7 @@ class _QueryEvaluator:
         descent does not end on the level; and the radius of a ball about it in which no surface
         point is nearer to p, 0 if the descent does not converge."""
         y, is_converged, on_level = self._descent.descend(p, start)
+        # The radius is the third result of `finish`.
         return dr.select(on_level, y, dr.nan), dr.select(
             is_converged, self._descent.finish(p, y)[2], 0
         )

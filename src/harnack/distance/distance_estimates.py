@@ -117,7 +117,8 @@ def signed_distance(
     if method == "lower_bound":
         _check_domain(field, x)
     if field.jumps is not None and method != "lower_bound":
-        # These methods do not see facets: the nearest one of the surface is searched for.
+        # These methods do not see facets: the nearest one of the surface is searched for. (The
+        # lambda shows no progress.)
         jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
@@ -281,6 +282,7 @@ def _warn_of_failures(name: str, result: ClosestPoints) -> None:
 
     name: the name of the public function, for messages. result: what its search found.
     """
+    # The warnings point to the caller of the public function, four calls up.
     count = len(result.closest)
     unresolved = int(np.isnan(result.closest[:, 0]).sum())
     if unresolved:

@@ -99,6 +99,7 @@ class JumpSurfaceSearch:
             _PROBE_HALF_LENGTH * backend.machine_epsilon * fmax(real(self.scale), dr.max(dr.abs(x)))
         )
         limit = real(limit)
+        # The place before the first facet: a sort key below all others.
         no_facet = NearestFacet(
             real(-1), index(NO_FACET), vector(dr.inf), vector(0), backend.Bool(False)
         )
@@ -175,7 +176,8 @@ class JumpSurfaceSearch:
         """
         jumps, backend = _jumps_of(self.surface), self.surface.backend
         real, index = backend.Float, backend.UInt32
-        # Asked for no lane, only to learn whether the field can list its facets.
+        # Asked for no lane (the limit 0 and the mask False), only to learn whether the field can
+        # list its facets. The sort key -1 is below all others.
         first_facet = jumps.nearest_facet(
             x, (real(-1), index(NO_FACET)), real(0), backend.Bool(False)
         )
@@ -296,6 +298,7 @@ def _nearest_jump_by_differences(backend: Backend, jumps: Jumps, x: Vec3) -> Nea
     x itself is on the facet to rounding.
     """
     real, vector = backend.Float, backend.Array3f
+    # d, h, size and epsilon are those of the docstring (there s is the size).
     d = real(jumps.distance(x))
     size = fmax(dr.max(dr.abs(x)), d)
     h = d * fmin(dr.cbrt(backend.machine_epsilon * size / d), 0.5)
@@ -306,10 +309,12 @@ def _nearest_jump_by_differences(backend: Backend, jumps: Jumps, x: Vec3) -> Nea
         differences.append(behind - ahead)
     descent = vector(*differences)
     gradient_norm = dr.norm(descent)
-    # At a point with several nearest facets the differences may cancel: then x is returned.
+    # The differences have the length 2 h if one facet is nearest. At a point with several nearest
+    # facets they may cancel: then x itself counts as the nearest point.
     has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.machine_epsilon * size)
     direction = dr.select(has_direction, descent / gradient_norm, vector(1 / math.sqrt(3)))
     offset = dr.select(has_direction, d * direction, 0)
+    # Which facet it is is not known: the index is 0, and the point may lie on an edge (False).
     return NearestFacet(d, backend.UInt32(0), offset, direction, backend.Bool(False))
 
 
@@ -532,6 +537,7 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
     def is_active(*state: Any) -> Mask:
         return state[7]
 
+    # At the start no plane is known: three times the normal 0.
     start = (
         d, t, vector(foot), real(_INITIAL_STEP), real(0), count(0), count(0), active,
         *3 * (vector(0), real(0)),

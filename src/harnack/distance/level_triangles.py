@@ -68,6 +68,7 @@ class LevelTriangles:
         has only those triangles that are proved to belong to the surface as a whole.
         """
         if isinstance(surface.field, MeshSolid) and surface.clip_volume is None:
+            # The boundary of the solid is the level 0.
             if surface.field.domain is not None or any(surface.level_values):
                 return None
             solid = surface.field.surface

@@ -138,6 +138,7 @@ def curvature(
 
         acceptance: the acceptance factor of the treecode; the larger it is, the smaller the error.
         """
+        # With derivatives up to the second.
         values = field.values_at(p, 2, acceptance)
         if values.gradient is None or values.hessian is None:
             raise RuntimeError(f"{type(field).__name__}: values_at(x, 2) gave no derivatives")
@@ -147,7 +148,7 @@ def curvature(
         )
         return derivatives.curvatures()
 
-    return _refine_accuracy(backend, field, from_tree, points, True)
+    return _refine_accuracy(backend, field, from_tree, points, True)  # the treecode can refine
 
 
 def _refine_accuracy(
@@ -453,7 +454,7 @@ class _CurvatureLineTracer:
         integer, vector, n = self.backend.UInt32, self.backend.Array3f, len(seeds)
         x = upload_vectors(self.backend, np.concatenate([seeds, seeds]))
         x = self._on_surface(x, _SEED_NEWTON_STEPS)
-        direction, is_known = self._direction(x, None)
+        direction, is_known = self._direction(x, None)  # there is no direction before
         lane = dr.arange(integer, 2 * n)
         # An eigenvector and its negative: the two directions from each seed.
         direction = dr.select(lane < n, direction, -direction)
@@ -473,6 +474,7 @@ class _CurvatureLineTracer:
             )
 
         no_steps = dr.zeros(integer, 2 * n)
+        # (`& True` makes an array of its own for the loop.)
         loop_while_active(
             _LineState(x, direction, no_steps, is_known & True), body, "curvature lines"
         )
@@ -494,7 +496,7 @@ class _CurvatureLineTracer:
         third, _ = self._direction(x + 0.5 * h * second, second)
         fourth, _ = self._direction(x + h * third, third)
         end = x + h / 6 * (first + 2 * (second + third) + fourth)
-        end = self._on_surface(end, 1)
+        end = self._on_surface(end, 1)  # one step of Newton's method
         last, is_known = self._direction(end, fourth)
         return end, last, is_known & (dr.dot(first, last) > _MIN_STEP_COSINE)
 

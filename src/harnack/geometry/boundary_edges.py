@@ -299,6 +299,7 @@ def _group_equal_rows(rows: npt.NDArray[np.uint64]) -> tuple[IntArray, IntArray]
     for column in rows.T:
         hashes ^= column
         hashes *= _GOLDEN
+        # The product has mixed the high bits only: they are brought down.
         hashes ^= hashes >> np.uint64(29)
     order = np.argsort(hashes).astype(np.int64, copy=False)
     hashes = hashes[order]

@@ -291,6 +291,7 @@ class Polytope(Volume):
         is_inside = np.ones(len(x), dtype=np.bool_)
         for row in rows:
             n, h = row[:3], float(row[3])
+            # A bound of the rounding of n.x - h.
             slack = 8.0 * sys.float_info.epsilon * (np.abs(x) @ np.abs(n) + abs(h))
             is_inside &= x @ n - h <= slack
         return is_inside
@@ -409,6 +410,7 @@ class Box(Polytope):
         coordinate."""
         lower = as_point(self.lower, "the lower corner of a box", finite=False)
         upper = as_point(self.upper, "the upper corner of a box", finite=False)
+        # A box from inf, or up to -inf, has no point either.
         if any(a > b or a == np.inf or b == -np.inf for a, b in zip(lower, upper, strict=True)):
             raise ValueError(
                 f"a box needs lower <= upper in each coordinate, not {lower} and {upper}"
@@ -497,6 +499,7 @@ class VolumeIntersection(Volume):
         if not members:
             raise ValueError("an intersection needs at least one volume")
         for member in members:
+            # `check_volume` accepts None; here a text, which it refuses, takes its place.
             check_volume(cast("Any", member) or "none", "each part of an intersection")
         object.__setattr__(self, "volumes", members)
 

@@ -550,6 +550,7 @@ def _outward_signs(x: FloatArray, normals: FloatArray, component: IntArray) -> F
         highest = np.flatnonzero(height == np.maximum.reduceat(height, starts)[component])
         _, first = np.unique(component[highest], return_index=True)
         outwardness += normals[highest[first]] @ direction
+    # For flat components, the largest coordinate of the sum of their normals decides.
     total = np.add.reduceat(normals, starts)
     main_component = np.take_along_axis(total, np.abs(total).argmax(axis=1)[:, None], axis=1)[:, 0]
     decisive = np.where(np.abs(outwardness) > 1e-6, outwardness, main_component)

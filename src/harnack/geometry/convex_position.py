@@ -106,6 +106,7 @@ def _lies_on_hull(x: FloatArray) -> bool:
             return False
     next_normals = np.roll(normals, -1, axis=0)
     # No vertex exceeds the planes of these two edges: nothing is moved, and no angle is required.
+    # Elsewhere the proof in `is_convex_position` requires n.n' >= -0.9.
     is_exact = is_strict & np.roll(is_strict, -1)
     return bool((is_exact | ((normals * next_normals).sum(axis=1) >= -0.9)).all())
 
@@ -332,8 +333,8 @@ def _hull_normals(x: FloatArray) -> tuple[FloatArray, bool]:
     and whether the points are flat or on a line. For flat points the normals are those of the two
     sides of a slab, and of the edges of the points' outline in their plane; for points on a line,
     those of a rod (a box)."""
-    # The axes along which the points vary most, less and least. For fewer than three points the
-    # missing axes are added (`full_matrices`).
+    # The axes along which the points vary most, less and least: the third result of `svd`. For
+    # fewer than three points the missing axes are added (`full_matrices`).
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=len(x) < 3)[2]
     coordinates: FloatArray = np.einsum("ij,kj->ik", x, axes)
     thickness: FloatArray = np.ptp(coordinates, axis=0)

@@ -141,7 +141,7 @@ def estimate_noise(points: FloatArray, normals: FloatArray | None, tree: Any) ->
     """
     rng = np.random.default_rng(0)
     probes = np.sort(rng.choice(len(points), min(len(points), _PROBES), replace=False))
-    noise = NoiseEstimate(0.0, 1.0)
+    noise = NoiseEstimate(0.0, 1.0)  # replaced in the loop
     for count in _COUNTS:
         index, distance = nearest_neighbors(tree, points[probes], count)
         offsets = points[index] - points[probes, None]
@@ -198,6 +198,7 @@ def _deviations_by_normals(
     """
     is_similar = np.einsum("mi,mki->mk", normals, neighbor_normals) > _MIN_NORMAL_COSINE
     heights = np.einsum("mki,mki->mk", 0.5 * (normals[:, None] + neighbor_normals), offsets)
+    # At least 2, as count - 1 divides.
     count = np.maximum(is_similar.sum(axis=1), 2)
     mean = (heights * is_similar).sum(axis=1) / count
     return np.sqrt(((heights - mean[:, None]) ** 2 * is_similar).sum(axis=1) / (count - 1))
@@ -272,7 +273,7 @@ class CloudDenoiser:
             adjacent = _neighbors(self.tree, start, _PLANE_NEIGHBORS)
         else:
             tree = build_point_tree(start)
-            nearest = _neighbors(tree, self.points, 1)[:, 0]
+            nearest = _neighbors(tree, self.points, 1)[:, 0]  # a single neighbor
             adjacent = _neighbors(tree, start, _INITIAL_NEIGHBORS)
             start = _move_along_normals(start, normals, adjacent, start, normals, normal_scale)
         neighbors = _neighbors(self.tree, start, self.noise.neighbor_count)
@@ -284,6 +285,7 @@ class CloudDenoiser:
             moved = _move_along_normals(
                 start, normals, neighbors, self.points, normals[nearest], normal_scale
             )
+        # Points are judged at their old places, where their neighbors were found.
         is_self = neighbors == self.selected[:, None]
         is_kept = (
             _agreeing_weight(

@@ -185,6 +185,7 @@ def spiky_polygon(
 
     rng: the source of random numbers.
     """
+    # At least 3 vertices, at angles that vary by up to 0.3 of their distance.
     t = _angles(n, 3) + rng.uniform(-0.3, 0.3, size=n) * (2.0 * np.pi / n)
     radii = rng.uniform(0.6, 1.0, size=n)
     radii[1::2] = rng.uniform(inner, 1.5 * inner, size=len(radii[1::2]))

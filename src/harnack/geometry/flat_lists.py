@@ -23,5 +23,6 @@ def next_in_lists(sizes: IntArray) -> IntArray:
     following = np.arange(1, int(sizes.sum()) + 1, dtype=np.int64)
     sizes = sizes[sizes > 0]
     ends = np.cumsum(sizes)
+    # The last entry of each list is followed by its first.
     following[ends - 1] = ends - sizes
     return following

@@ -135,17 +135,17 @@ class PolygonFaces:
         length = np.linalg.norm(normal, axis=1)
         normal /= np.where(length > 0, length, 1)[:, None]
         edge = x[self.next_corner] - x
-        # A millionth of the product of the lengths of both edges, to be compared with their cross
-        # product.
-        min_sine = np.linalg.norm(edge, axis=1)
-        min_sine *= _MIN_TURN_SINE * min_sine[self.next_corner]
+        # A millionth of the product of the lengths of both edges at a corner, to be compared with
+        # their cross product.
+        least_cross = np.linalg.norm(edge, axis=1)
+        least_cross *= _MIN_TURN_SINE * least_cross[self.next_corner]
         # The projection of the edges; all turns must be to the left, and add up to one revolution.
         edge -= (edge * normal[face]).sum(axis=1)[:, None] * normal[face]
         next_edge = edge[self.next_corner]
-        sine = (np.cross(edge, next_edge) * normal[face]).sum(axis=1)
-        cosine = (edge * next_edge).sum(axis=1)
-        turns_left = np.logical_and.reduceat(sine > min_sine, first)
-        total_turn = np.add.reduceat(np.arctan2(sine, cosine), first)
+        cross_product = (np.cross(edge, next_edge) * normal[face]).sum(axis=1)
+        dot_product = (edge * next_edge).sum(axis=1)
+        turns_left = np.logical_and.reduceat(cross_product > least_cross, first)
+        total_turn = np.add.reduceat(np.arctan2(cross_product, dot_product), first)
         is_once = np.abs(total_turn - 2 * np.pi) < _REVOLUTION_TOLERANCE
         is_single = np.bincount(self.face_of_loop, minlength=self.face_count) == 1
         return turns_left & is_once & is_single & (length > 0)
@@ -364,6 +364,7 @@ def cluster_into_polygons(
     cluster_of = _clusters(vertices, faces, count, iterations, seed)
     order = np.argsort(cluster_of, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(cluster_of[order])) + 1)
+    # For each cluster the loops of its boundary.
     loops = [join_edges(boundary_edges(part.tolist())) for part in parts]
     # A cluster that is a closed surface has no boundary.
     loops = [cluster for cluster in loops if cluster]
@@ -427,11 +428,13 @@ def _clusters(
     centers = points[rng.choice(len(points), count, p=probability, replace=False)]
     cluster_of = np.zeros(len(faces), dtype=np.int64)
     for _ in range(iterations):
+        # [1]: the index of the nearest center (after the distance).
         cluster_of = kd_tree(centers).query(points)[1]
         weight = np.bincount(cluster_of, area, count)
         for axis in range(points.shape[1]):
             moment = np.bincount(cluster_of, area * points[:, axis], count)
             centers[:, axis] = np.where(weight > 0, moment / np.maximum(weight, 1e-300), np.inf)
+        # Clusters without triangles, whose centers are infinite, are dropped.
         centers = centers[weight > 0]
         count = len(centers)
     return kd_tree(centers).query(points)[1]

@@ -213,7 +213,7 @@ def _projections(vertices: FloatArray, polygons: IntArray) -> FloatArray:
     # The axis most across the normal gives a first tangent, the cross product the second.
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     second = np.cross(normal, first)
-    size = np.abs(offsets).max(axis=(1, 2), keepdims=True)[..., 0]
+    size = np.abs(offsets).max(axis=(1, 2), keepdims=True)[..., 0]  # (m, 1)
     axes = [axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True) * size, 1e-300)
             for axis in (first, second)]  # fmt: skip
     return np.stack([np.einsum("mkj,mj->mk", offsets, axis) for axis in axes], axis=2)
@@ -254,6 +254,7 @@ def _perturb_straight_corners(projection: FloatArray) -> FloatArray:
     turn = arriving[:, 0] * leaving[:, 1] - arriving[:, 1] * leaving[:, 0]
     is_straight = (np.abs(turn) <= _FLAT_AREA) & ((arriving * leaving).sum(axis=1) > 0.0)
     ends = np.flatnonzero(~is_straight)
+    # All corners are straight, or none is.
     if len(ends) in (0, len(projection)):
         return projection
     k = np.arange(len(projection))

@@ -39,7 +39,8 @@ def smooth_curve(
         continuous at the second point and the last but one ("not a knot").
     spacing: the growth of the parameter from point to point. "centripetal": the square root of
         their distance; curves then hardly swing out or loop where points are spaced unevenly (Lee
-        1989). "chord": the distance, which makes rounder curves of evenly spaced points.
+        1989). "chord": the distance itself; curves are then rounder where points are spaced almost
+        evenly.
 
     Returns:
         The vertices, with k = samples_per_segment: (n k, 3) for a closed curve, ((n - 1) k + 1, 3)
@@ -114,7 +115,8 @@ def _spline(x: FloatArray, samples: int, closed: bool, power: float) -> FloatArr
     from scipy.interpolate import CubicSpline  # imported here: it takes half a second
 
     spline = CubicSpline(parameters, knots, bc_type="periodic" if closed else "not-a-knot")
-    inner = parameters[:-1, None] + np.diff(parameters)[:, None] * (np.arange(samples) / samples)
-    vertices = spline(inner.ravel())
+    # The parameters of the samples (segments, samples), each segment from its first point on.
+    sampled = parameters[:-1, None] + np.diff(parameters)[:, None] * (np.arange(samples) / samples)
+    vertices = spline(sampled.ravel())
     vertices[::samples] = knots[:-1]
     return vertices if closed else np.concatenate([vertices, knots[-1:]])

@@ -128,7 +128,7 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
         ValueError: not three numbers, NaN, or infinite where it must not be.
     """
     try:
-        if isinstance(value, str | bytes):
+        if isinstance(value, str | bytes):  # iterable, but not of numbers
             raise TypeError
         numbers = tuple(as_real(v, name) for v in value)
     except TypeError:

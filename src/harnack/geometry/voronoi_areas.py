@@ -188,9 +188,9 @@ def _below(count: Any) -> Callable[..., Mask]:
 
 
 def _line_in_disc(backend: Backend, q: tuple[Real, Real], b: Real) -> _BisectorLine:
-    """The line q . y = b in the plane, with its normal scaled to unit length. If it misses the unit
-    disc, its normal becomes 0. q is the projection of the neighbor to the plane, and is kept with
-    the line."""
+    """The line q . y = b in the plane, b >= 0, with its normal scaled to unit length. If it misses
+    the unit disc, its normal becomes 0, and its distance from the point 1. q is the projection of
+    the line's neighbor to the plane, and is kept with the line."""
     length = dr.sqrt(dr.square(q[0]) + dr.square(q[1]))
     crosses = length > b
     inverse = dr.select(crosses, dr.rcp(length), 0)

@@ -67,6 +67,7 @@ class Welded:
         cancel. Wider gaps stay, as two vertices are joined only if they are as near as two results
         of the same computation.
         """
+        # First only vertices at the same position are joined: 0 that differ by rounding.
         welded = cls._from_index(weld_vertices(vertices), vertices, faces, 0)
         # The mesh is closed.
         if not len(welded.edges):

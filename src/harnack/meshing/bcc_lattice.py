@@ -185,6 +185,7 @@ class BccLattice:
         of the box count as in the mask. Both masks have the shape `counts`."""
         padded = np.pad(cells, 1, constant_values=True)
         inner = cells.copy()
+        # All shifts of the mask by -1, 0 and 1 cells along each axis.
         for shift in itertools.product((0, 1, 2), repeat=3):
             inner &= padded[tuple(slice(i, i + n) for i, n in zip(shift, cells.shape, strict=True))]
         return inner
@@ -204,7 +205,7 @@ class BccLattice:
         padded = np.pad(cells, 1)
         touches = np.zeros(len(coordinates), np.bool_)
         for offset in itertools.product((-1, 0), repeat=3):
-            # For an odd coordinate both offsets lead to the same cell.
+            # For an odd coordinate both offsets lead to the same cell. (1 is the padding.)
             index = (coordinates + offset) // 2 + 1
             touches |= padded[tuple(index.T)]
         return touches

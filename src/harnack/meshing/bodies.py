@@ -191,7 +191,7 @@ def united_parts(
         size = _GROWTH * float(np.ptp(x[faces], axis=(0, 1)).max())
         signs = [math.copysign(1, volume_of(shell.vertices, shell.faces)) for shell in shells]
         return _union_of_components(
-            [grown(shell, s * size) for shell, s in zip(shells, signs, strict=True)], within
+            [grown(shell, sign * size) for shell, sign in zip(shells, signs, strict=True)], within
         )
 
 
@@ -255,6 +255,7 @@ def _union_of_components(components: list[TriangleMesh], within: float) -> Trian
     clockwise = [body for body, is_outward in bodies if not is_outward]
     # sets[k] is L_(k+1) of the proof: the points around which the components so far wind at least k
     # + 1 times. Each clockwise component needs one set more, since it moves L_(k+1) to L_k.
+    # (Of manifold3d solids, ^ is the intersection, + the union, and - the difference.)
     sets = [Manifold() for _ in range(len(clockwise) + 1)]
     for solid in (body for body, is_outward in bodies if is_outward):
         shared = [sets[k] ^ solid for k in range(len(sets) - 1)]

@@ -70,7 +70,7 @@ def near_pairs(vertices: FloatArray, faces: IntArray, among: BoolArray | None) -
     if not chosen.any():
         return batches[0]
     largest = float(np.abs(vertices).max(initial=0.0))
-    # Scaled by a power of two, so that nothing is rounded.
+    # Scaled by a power of two (`frexp` gives it second), so that nothing is rounded.
     scaled = np.ldexp(vertices, -int(np.frexp(largest)[1])) if largest else vertices
     boxes, pairs = _FaceBoxTree.of(scaled[faces], chosen), _PairTests.of(scaled, faces)
     rows = boxes.order[chosen[boxes.order]]
@@ -164,7 +164,7 @@ class _FaceBoxTree:
             dr.scatter(partners, integer(index), slot, has_room)
             return state
 
-        traverse(self.tree, visit, (real(0),))
+        traverse(self.tree, visit, (real(0),))  # the traversal's own state is not used
         dr.eval(pair_count, own_faces, partners)
         count = int(to_numpy(pair_count)[0])
         if count > room:
@@ -269,6 +269,7 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
         (`_are_apart`) where the condition on a plane holds already."""
         return arguments[12] < 0
 
+    # The other two conditions are tested on those lanes only on which no plane proves it.
     arguments = (*a, *b, *is_shared_a, *is_shared_b, shared_count)
     return by_plane | dr.if_stmt(arguments, ~by_plane, by_edges_or_line, never)
 
@@ -425,5 +426,5 @@ def _are_opposite_at_corner(a: Corners, b: Corners) -> Mask:
     rounding = ROUNDING * dr.norm(plane_normal)
     # The dot products with the edges of a, then of b; each with a bound of its rounding error.
     values = [(dr.dot(plane_normal, edge), rounding * dr.norm(edge) + _UNDERFLOW) for edge in edges]
-    (p, one), (q, two), (r, three), (s, four) = values
-    return (p < -one) & (q < -two) & (r > three) & (s > four)
+    (a1, a1_error), (a2, a2_error), (b1, b1_error), (b2, b2_error) = values
+    return (a1 < -a1_error) & (a2 < -a2_error) & (b1 > b1_error) & (b2 > b2_error)

@@ -251,7 +251,9 @@ def _askew_lines() -> FloatArray:
     """Directions of 13 lines as unit vectors (13, 3): the axes, the face diagonals and the space
     diagonals of a cube. The cube is turned so that no line is near a coordinate plane or a plane at
     45 degrees to two axes."""
+    # Of the 27 vectors, the first 13 are the negatives of the last 13; the one between is 0.
     directions = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))[14:]
+    # The rows of an orthogonal matrix; the numbers were found by trial.
     frame: FloatArray = np.linalg.qr([[7, 7, -3], [3, -16, -7], [19, 7, -13]])[0]
     return (directions / row_norms(directions)[:, None]) @ frame
 

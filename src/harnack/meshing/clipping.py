@@ -133,8 +133,9 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     is_out = (h > 0)[faces]
     # Faces on the boundary with no corner inside are left out.
     is_kept = (h < 0)[faces].any(axis=1)
-    mixed = is_kept & is_out.any(axis=1)
-    edges = np.concatenate([faces[mixed][:, [k, (k + 1) % 3]] for k in range(3)])
+    # Faces with corners on both sides are cut.
+    is_mixed = is_kept & is_out.any(axis=1)
+    edges = np.concatenate([faces[is_mixed][:, [k, (k + 1) % 3]] for k in range(3)])
     # Edges with one end inside and the other outside; a product of different signs is negative.
     crossed = edges[h[edges[:, 0]] * h[edges[:, 1]] < 0]
     keys = np.unique(edge_keys(crossed, len(vertices)))
@@ -153,16 +154,21 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
         return np.where(h[i] == 0, i, first_new + index)
 
     pieces = [faces[is_kept & ~is_out.any(axis=1)]]
-    rows = faces[mixed]
+    rows = faces[is_mixed]
     # How many corners of each face are outside: one or two.
-    number = is_out[mixed].sum(axis=1)
+    outer_count = is_out[is_mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        tri = rows[(number == 1) & is_out[mixed][:, k]][:, order]  # the first corner is outside
-        # Two corners inside: the part is a quadrilateral, two triangles.
+        tri = rows[(outer_count == 1) & is_out[is_mixed][:, k]][
+            :, order
+        ]  # the first corner is outside
+        # Two corners inside: the part is a quadrilateral, two triangles. p and q are the points at
+        # which the edges at the outer corner are cut.
         p, q = (crossing(tri[:, 1], tri[:, 0]), crossing(tri[:, 2], tri[:, 0]))
         pieces += [np.stack([tri[:, 1], tri[:, 2], p], axis=1), np.stack([tri[:, 2], q, p], axis=1)]
-        tip = rows[(number == 2) & ~is_out[mixed][:, k]][:, order]  # the first corner is inside
+        tip = rows[(outer_count == 2) & ~is_out[is_mixed][:, k]][
+            :, order
+        ]  # the first corner is inside
         pieces.append(
             np.stack([tip[:, 0], crossing(tip[:, 0], tip[:, 1]), crossing(tip[:, 0], tip[:, 2])], 1)
         )

@@ -97,6 +97,7 @@ def _grid_spacing(x: FloatArray) -> float:
         MeshingError: the grid is too coarse for the size of the mesh, or coordinates are too large.
     """
     largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
+    # (`frexp` gives the exponent second.)
     step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
     # `not <=` also refuses coordinates that are not numbers.
     if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:

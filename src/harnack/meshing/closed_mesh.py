@@ -178,7 +178,7 @@ def extruded_manifold(
     """
     section, scale = _cross_section(outline)
     inverse_scale = (1 / scale, 1 / scale, 1 / scale)
-    if twist == 0:
+    if twist == 0:  # neither intermediate sections (0) nor a twist (0.0)
         return section.extrude(height * scale, 0, 0.0, (taper, taper)).scale(inverse_scale)
     rate, growth = math.radians(twist) / height, (taper - 1.0) / height
     radius = max(float(np.linalg.norm(loop, axis=1).max()) for loop in outline)
@@ -259,6 +259,7 @@ def volume_manifold(
         return box_manifold(low, high) if (low < high).all() else Manifold()
     if isinstance(volume, HalfSpace | ConvexHull):
         for row in volume.planes():
+            # A half-space x . n <= h; manifold3d keeps the side to which its normal points.
             x, y, z, h = (float(v) for v in row)
             manifold = manifold.trim_by_plane((-x, -y, -z), -h)
         return manifold

@@ -75,6 +75,7 @@ def largest_body(surface: TriangleMesh) -> TriangleMesh:
             raise MeshingError("a part of the mesh is inside out: choose a smaller `cell_size`")
         outer_shell_of[cavity] = outer_shell
         body_volumes[outer_shell] += shells.volumes[cavity]
+    # -1 if there is no shell; then no face is chosen.
     largest = outer_shells[body_volumes[outer_shells].argmax()] if len(outer_shells) else -1
     return TriangleMesh.without_unused_vertices(
         surface.vertices, surface.faces[outer_shell_of[shells.component_of_face] == largest]
@@ -151,17 +152,19 @@ class Shells:
     @classmethod
     def of(cls, surface: TriangleMesh) -> Shells:
         """Find the connected components of a closed surface, their volumes and their boxes."""
-        number = np.unique(_component_of_faces(surface), return_inverse=True)[1]
+        # The components are numbered from 0.
+        component = np.unique(_component_of_faces(surface), return_inverse=True)[1]
         corners = surface.vertices[surface.faces]
         # Relative to the center, so that rounding errors are relative to the size of the mesh.
         offset = corners[:, 0] - surface.vertices[surface.faces].mean(axis=(0, 1))
         volumes = (
-            np.bincount(number, row_dots(area_normals(surface.vertices[surface.faces]), offset)) / 6
+            np.bincount(component, row_dots(area_normals(surface.vertices[surface.faces]), offset))
+            / 6
         )
         lower, upper = np.full((len(volumes), 3), np.inf), np.full((len(volumes), 3), -np.inf)
-        np.minimum.at(lower, number, corners.min(axis=1))
-        np.maximum.at(upper, number, corners.max(axis=1))
-        return cls(number, volumes, lower, upper, corners)
+        np.minimum.at(lower, component, corners.min(axis=1))
+        np.maximum.at(upper, component, corners.max(axis=1))
+        return cls(component, volumes, lower, upper, corners)
 
     def winding_number(self, component: Any, part: Any) -> float:
         """The winding number of the component with index `component` around a point of the
@@ -175,6 +178,7 @@ class Shells:
         of other components, and 0 for outermost ones."""
         depth = np.zeros(len(self.volumes), np.int64)
         for k in range(len(depth)) if len(depth) > 1 else ():
+            # The center of the component's first face.
             point = self.corners[np.argmax(self.component_of_face == k)].mean(axis=0)
             # A component winds only around points in its box.
             in_box = ((self.lower < point) & (point < self.upper)).all(axis=1)

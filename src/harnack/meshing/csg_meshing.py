@@ -190,6 +190,7 @@ class CsgMesher:
             manifold = method(self, solid, level) if isinstance(solid, kind) else None
             if manifold is not None:
                 return manifold
+        # [0]: the mesh.
         return to_manifold(self.mesh_smooth_level(solid, level)[0])
 
     def _mesh_boolean(self, solid: BooleanSolid, level: float) -> Manifold:
@@ -197,9 +198,9 @@ class CsgMesher:
         factored out and operands that cancel were dropped."""
         from manifold3d import Manifold
 
-        apart = factor_common_operands(solid, level) if solid.is_union else None
-        if apart is not None:
-            return self.mesh_sublevel(apart, 0.0)
+        factored = factor_common_operands(solid, level) if solid.is_union else None
+        if factored is not None:
+            return self.mesh_sublevel(factored, 0.0)  # its level is 0
         reduced = drop_cancelled_operands(flatten_csg(solid), level)
         return Manifold() if reduced is None else self._combine_operands(reduced, level)
 
@@ -391,6 +392,7 @@ class CsgMesher:
         lattice = BccLattice.covering_box(
             self.lower, self.upper, float((self.upper - self.lower).max()) / 8
         )
+        # The centers of all cells, whose lattice coordinates are odd.
         points = lattice.points(2 * np.argwhere(np.ones(lattice.counts)) + 1)
         middle = 0.5 * (low + high)
         samples = self.function(field, middle).sample(points)
@@ -467,6 +469,7 @@ class CsgMesher:
         if is_single_level_set(solid.field):
             return None
         matrix, offset = np.array(solid.map.matrix), np.array(solid.map.translation_vector)
+        # The eight corners of this box.
         ends = np.stack([self.lower, self.upper])
         corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), axis=-1).reshape(-1, 3)
         # The box around the preimage of this box. The map stretches lengths by at most `scale`.
@@ -675,6 +678,7 @@ def solid_and_level(field: Field, solid: Any, level: float | None) -> tuple[Soli
     if solid is True and isinstance(field, Solid):
         level = field.default_level if level is None else as_finite(level, "level")
         return field, level
+    # The boundary of each solid made here is its level 0.
     low, high = solid_value_range(field, solid, level)
     if low == -math.inf:
         return solid_of(field, below=high), 0.0
@@ -801,6 +805,7 @@ def _check_and_mend(
     try:
         check(surface, size)
     except OffLevelError as error:
+        # (The mesher's tolerance is half of the whole one.)
         moved = project_outliers(
             mesher.function(solid, level), surface, error.locations, 2 * mesher.tolerance,
             lambda candidate: check(candidate, size),
@@ -931,5 +936,6 @@ def _snap_to_boxes(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     vertices = surface.vertices
     for box in boxes:
         if isinstance(box, Box):
+            # (Within 1e-12 of the plane's coordinate.)
             vertices = snap_to_box(np.clip(vertices, *box.bounds()), box, 1e-12)
     return TriangleMesh(vertices, surface.faces)

@@ -31,6 +31,7 @@ def factor_common_operands(union: BooleanSolid, level: float) -> Solid | None:
     | (A & C) becomes A & (B | C). The operand that occurs most often decides which intersections
     are rewritten. Returns a solid with the function f such that {f <= 0} is {union <= level}; None
     if no two of the intersections have a common operand."""
+    # For each operand of the union, the sets of which it is the intersection, by their keys.
     terms = [{_key(*factor): factor for factor in _factors(part, level)} for part in union.parts]
     common_key, times = Counter(key for term in terms for key in term).most_common(1)[0]
     if times < 2:

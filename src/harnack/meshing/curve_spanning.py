@@ -145,6 +145,7 @@ def _push_inward(
     distance = 4 * fraction * (1 - fraction) * max_distance[edge]
     direction = _unit_perpendicular(inwards[inner], edge_direction)
     start = points + distance[:, None] * direction
+    # With steps of at most 0.3 of the distance, and without walls.
     projected = newton_to_level(function, start, function.sample(start), 0.3 * distance, None)
     # Points keep their position along the edge and their distance from it: they turn about it.
     toward = _unit_perpendicular(projected - points, edge_direction)

@@ -159,20 +159,21 @@ def box_cells(
         times a power of two, which may reach beyond the box on all sides.
     """
     size = upper - lower
-    finest = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
-    # At first the longest side has up to 8 cells; the rest is left to halvings.
+    halvings = max(1, math.ceil(math.log2(float(size.max()) / spacing)))
+    # At first the longest side has up to 8 = 2^3 cells; the rest is left to halvings.
     if exact:
-        edge = float(size.max()) / 2 ** min(finest, 3)
+        edge = float(size.max()) / 2 ** min(halvings, 3)
+        # (1 - 1e-9: rounding adds no cell.)
         counts = np.maximum(1, np.ceil(size / edge * (1 - 1e-9))).astype(int)
-        finest = max(0, math.ceil(math.log2(float((size / counts).max()) / spacing)))
+        halvings = max(0, math.ceil(math.log2(float((size / counts).max()) / spacing)))
         edges = size / counts
     else:
-        edge = spacing * 2.0 ** max(0, finest - 3)
+        edge = spacing * 2.0 ** max(0, halvings - 3)
         counts = np.maximum(1, np.ceil(size / edge)).astype(int)
         lower, edges = 0.5 * (lower + upper - counts * edge), np.full(3, edge)
-        finest = round(math.log2(edge / spacing))
+        halvings = round(math.log2(edge / spacing))
     grid = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    return BoxCells(lower + grid * edges, edges), finest
+    return BoxCells(lower + grid * edges, edges), halvings
 
 
 def sample_delaunay_points(
@@ -203,6 +204,7 @@ def sample_delaunay_points(
     # Leaves of the octree are `occupied` (they may hold the level set) or proved `empty`.
     tree = refine_cells(root[0], function.clearance, _MAX_CELLS, root[1])
     points, size = _corners_and_centers(tree, _subdivided_cells(function, tree.occupied, finer))
+    # Large empty cells count as twice as large as the occupied ones at most.
     min_curve_distance = _MIN_CURVE_DISTANCE * np.minimum(size, 2 * float(tree.occupied.size.max()))
     is_far = _is_far(points, min_curve_distance, boundary)
     points, size = points[is_far], size[is_far]
@@ -370,6 +372,7 @@ def snap_to_level(
     points (n, 3); their samples; and a mask (n,) of those that may be used: the method converged,
     and moved the point by less than `max_distance` (n,).
 
+    function, points, samples, max_step, walls, steps: as in `newton_to_level`.
     size: (n,) the size of cells at the points, to which distances from the level set are compared.
     """
     moved = newton_to_level(function, points, samples, max_step, walls, steps)
@@ -438,6 +441,7 @@ def to_multiple_roots(
     """
     x = points
     for k in range(_SERIES_STEPS):
+        # Two single steps, without walls (None).
         once = newton_to_level(
             function, x, samples if k == 0 else function.sample(x), max_step, None, steps=1
         )

@@ -130,6 +130,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
     elif not len(boundary) and mesh.volume < 0:
         mesh.invert()
     mesh.metadata["harnack"] = {
+        # 0 if `facts` does not say otherwise.
         "proved": 0,
         "integrated": 0,
         **facts,

@@ -155,7 +155,7 @@ def _fill_all_holes(
     Raises:
         MeshingError: the filling could not be computed, or intersects the mesh or itself.
     """
-    if not len(edges):
+    if not len(edges):  # no hole: no vertices and no faces
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     # Each boundary edge counts once, in its direction.
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
@@ -271,6 +271,7 @@ def triangle_fills(vertices: FloatArray, faces: IntArray, edges: IntArray) -> In
     triangles = triangles[np.linalg.norm(_unit_normals(corners), axis=1) > 0]
     together = np.concatenate([faces, triangles])
     is_new = np.arange(len(together)) >= len(faces)
+    # Of the intersecting faces those that are new.
     intersecting = np.setdiff1d(
         intersecting_faces(vertices, together, is_new), np.arange(len(faces))
     )
@@ -391,6 +392,7 @@ def _refine_patches(
             surface.
     """
     failed = x[:0]
+    # (None: there are no walls.)
     for mode in ("improving", "smoothing", "refining alone"):
         report(mode)
         new_vertices, new_faces = (
@@ -442,6 +444,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
     """
     is_at_middle = (faces == middle).any(axis=1)
     faces_at_middle, others = faces[is_at_middle], faces[~is_at_middle]
+    # (number of intersecting faces, minus the smallest cosine of a turn, the new faces)
     candidates: list[tuple[int, float, IntArray]] = []
     for end in ends:
         at_end = (faces == end).any(axis=1)
@@ -463,6 +466,7 @@ def _collapse_midpoint(x: FloatArray, faces: IntArray, middle: int, ends: list[i
             "subdivide the mesh there, or choose a smaller `cell_size`",
             x[[middle]],
         )
+    # The new faces of the best candidate.
     return min(candidates, key=lambda candidate: candidate[:2])[2]
 
 

@@ -171,6 +171,7 @@ def _failure_reasons(
     together = np.concatenate([faces, new])
     is_new = np.arange(len(together)) >= len(faces)
     crossing = intersecting_faces(x, together, is_new)
+    # Of these, the faces of patches, as indices of `new`.
     reasons |= dict.fromkeys(
         owner[crossing[is_new[crossing]] - len(faces)].tolist(), "passing through other triangles"
     )
@@ -282,6 +283,7 @@ def _make_patches(
     the index of the loop that it helps to fill; and a dictionary from the indices of loops without
     a patch to the reasons, in words.
     """
+    # For each directed edge around the holes the third corner of its face.
     third = _opposite_corners(faces, np.unique(np.concatenate(loops)), len(vertices))
     used_edges = {(min(edge), max(edge)) for edge in third}
     fixed_edges = np.array(sorted(used_edges), np.int64).reshape(-1, 2)
@@ -302,6 +304,7 @@ def _make_patches(
         patches.append(triangles)
     if not patches:
         return vertices, faces[:0], np.zeros(0, np.int64), failed
+    # x has four columns: the coordinates, and the usual length of edges (`_refine_patches`).
     x, new = _refine_patches(vertices, faces, np.concatenate(patches), fixed_edges)
     # Without new vertices nothing can be moved. The last two rounds split no edges.
     for rounds_left in range(fairings if len(x) > len(vertices) else 0, 0, -1):
@@ -376,7 +379,7 @@ def _min_area_triangulation(
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
-        return polygon[None]
+        return polygon[None]  # a single triangle, (1, 3)
     # An infinite cost excludes a diagonal; `+=` below keeps it.
     cost = np.where(_forbidden_diagonals(polygon, used_edges), np.inf, 0.0)
     apex = np.zeros((n, n), np.int64)
@@ -438,7 +441,7 @@ def _min_dihedral_triangulation(
     """
     n, corner = len(polygon), x[polygon]
     if n == 3:
-        return polygon[None]
+        return polygon[None]  # a single triangle, (1, 3)
     barred = _forbidden_diagonals(polygon, used_edges)
     beside = np.zeros((n, n, 3))  # 0: no neighbor, or not yet
     for position in range(n):

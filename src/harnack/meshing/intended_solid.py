@@ -234,8 +234,9 @@ class IntendedSolid:
         points, normals = _on_faces(corner, _NEAR, rng)
         away = _NEAREST * self.size * normals
         beside = self.winding(np.concatenate([points + away, points - away]))
-        nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
-        fraction = float(nothing.mean())
+        # One row for each of the two sides.
+        has_nothing = (beside.reshape(2, -1) < 0.5).all(axis=0)
+        fraction = float(has_nothing.mean())
         if fraction > _OPEN_SHARE:
             raise MeshError(
                 f"the mesh is an open sheet: {fraction:.0%} of its area have nothing inside, on "
@@ -393,6 +394,7 @@ def _inside_out(x: FloatArray, faces: IntArray, parts: list[IntArray]) -> BoolAr
     closed_faces = [faces[rows] for rows in parts]
     volumes = [volume_of(x, part) for part in closed_faces]
     holds_rest = [_lies_in(x, open_faces, part) for part in closed_faces]
+    # The faces of no closed part; the closed parts inside of these are added.
     is_with_rest = is_rest.copy()
     for k, containers in enumerate(nested(x, closed_faces)):
         # `nested` lists the containers in order of increasing volume.

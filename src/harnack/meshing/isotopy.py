@@ -125,7 +125,7 @@ def isotopy_of(
         if it does not end there.
     """
     corners = points.points[tetrahedra]
-    if not _has_bounds(function, corners[is_cut]):
+    if not _has_bounds(function, corners[is_cut]):  # nothing is proved, anywhere
         return IsotopyCoverage(0.0, 0.0, int(is_cut.sum()), tetrahedra[is_cut])
     # Tetrahedra that count: those that the mesh meets, and those not proved to satisfy (a).
     uncut = np.flatnonzero(~is_cut)
@@ -140,6 +140,7 @@ def isotopy_of(
     proved = np.bincount(slopes.owner, minlength=len(index)) > 0
     proved &= ~has_curve_point
     rows = np.flatnonzero(proved[slopes.owner])
+    # With F at the first corners, and its gradient; points may move along all axes (ones).
     is_regular = _proved_regular(
         function, corners[slopes.owner[rows]], values[slopes.owner[rows], 0],
         slopes.slope[rows], np.ones(3),
@@ -172,6 +173,7 @@ def _has_bounds(function: LevelFunction, corners: FloatArray) -> bool:
     """
     tried = corners[:: max(1, len(corners) // _MAX_TRIED)]
     center, radius = _balls(tried)
+    # [1]: the bounds, after the samples.
     return not len(tried) or bool((function.gradient_bounds(center, radius)[1] < _NO_BOUND).any())
 
 
@@ -225,7 +227,9 @@ def _linear_gradients(
     """
     edges = corners[:, 1:] - corners[:, :1]
     size = np.linalg.norm(edges, axis=2).max(axis=1)
+    # By more than rounding.
     has_volume = np.abs(np.linalg.det(edges)) > 1e-9 * size**3
+    # At points on the level set F is exactly 0.
     on_level = (values == 0).all(axis=1)
     rows = np.flatnonzero(has_volume & ~on_level)
     # With d the edges from the first corner, grad F . d is the difference of the values at their
@@ -290,7 +294,8 @@ def _proved_by_stars(
     function: f.
     corners, index: (m, 4, 3), (m, 4) the corners of all tetrahedra, and the indices of these
         points.
-    slopes: the gradients of F on the tetrahedra.
+    slopes: the gradients of F; each has its tetrahedron as `owner`. A tetrahedron may have two
+        gradients, or none.
     """
     vertices = np.unique(index[rows])
     vertex_number = np.full(int(index.max(initial=0)) + 1, -1, np.int64)
@@ -306,10 +311,10 @@ def _proved_by_stars(
     normal = np.zeros((len(vertices), 3))
     np.add.at(normal, vertex_of_entry, units)
     for _ in range(_MAX_PERCEPTRON_ROUNDS):
-        is_short = (normal[vertex_of_entry] * units).sum(axis=1) <= 0
-        if not is_short.any():
+        is_violated = (normal[vertex_of_entry] * units).sum(axis=1) <= 0
+        if not is_violated.any():
             break
-        np.add.at(normal, vertex_of_entry[is_short], units[is_short])
+        np.add.at(normal, vertex_of_entry[is_violated], units[is_violated])
     # n . grad F > 0, by more than rounding.
     is_proved = np.ones(len(vertices), np.bool_)
     is_proved[vertex_of_entry[(normal[vertex_of_entry] * units).sum(axis=1) <= 1e-9]] = False
@@ -317,11 +322,11 @@ def _proved_by_stars(
     # A tetrahedron without a gradient proves nothing at its corners.
     is_proved[vertex_of_pair[~has_slope[tet]]] = False
     # n . grad f > 0 on each tetrahedron around the corners that are left; n takes the place of grad
-    # F.
+    # F. Then no value of F is needed (zeros), and points may move along all axes (ones).
     tried = np.flatnonzero(is_proved[vertex_of_pair])
-    start = np.zeros(len(tried))
+    no_values = np.zeros(len(tried))
     is_regular = _proved_regular(
-        function, corners[tet[tried]], start, normal[vertex_of_pair[tried]], np.ones(3)
+        function, corners[tet[tried]], no_values, normal[vertex_of_pair[tried]], np.ones(3)
     )
     is_proved[vertex_of_pair[tried[~is_regular]]] = False
     return np.asarray(is_proved[vertex_number[index[rows]]].all(axis=1), np.bool_)
@@ -352,7 +357,7 @@ def _proved_empty(function: LevelFunction, corners: FloatArray) -> BoolArray:
 def _proved_regular(
     function: LevelFunction,
     corners: FloatArray,
-    start: FloatArray,
+    first_values: FloatArray,
     slope: FloatArray,
     free: FloatArray,
 ) -> BoolArray:
@@ -362,14 +367,14 @@ def _proved_regular(
 
     function: f.
     corners: (n, k, 3) the corners of the simplices.
-    start: (n,) the values of F at the first corners of the simplices.
+    first_values: (n,) the values of F at the first corners of the simplices.
     slope: (n, 3) grad F on each simplex. For condition (c), the vector n of the theorem; then
-        `start` is 0.
+        `first_values` are 0.
     free: (3,) 1 for coordinates in which points may move, 0 for coordinates that a face of the box
         fixes.
     """
     # `pieces` are the parts that are undecided, and `owner` the simplices that they belong to.
-    owner, first = np.arange(len(corners)), corners[:, 0]
+    owner, first_corners = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
     half_period = np.inf if function.period is None else 0.499 * function.period
     for halving in range(_HALVINGS + 1):
@@ -384,6 +389,7 @@ def _proved_regular(
             break
         projected = slope[owner] * free
         gradient_length = np.linalg.norm(samples.gradient, axis=1)
+        # A bound of the change of f in the ball.
         moved = (gradient_length + change) * radius
         product = (samples.gradient * projected).sum(axis=1)
         # (b): grad f . grad F exceeds `change` |grad F| at the center, where `change` bounds how
@@ -391,7 +397,10 @@ def _proved_regular(
         # at the corners.
         is_regular = product > change * np.linalg.norm(projected, axis=1) * (1 + 1e-9)
         is_within_half_period = np.abs(samples.value) + moved < half_period
-        linear = start[owner, None] + ((pieces - first[owner, None]) * slope[owner, None]).sum(2)
+        # F at the corners of the pieces.
+        linear = first_values[owner, None] + (
+            (pieces - first_corners[owner, None]) * slope[owner, None]
+        ).sum(2)
         sign = np.sign(samples.value)
         is_regular |= (np.abs(samples.value) > moved) & (linear * sign[:, None] > 0).all(axis=1)
         # The lift stays within half a period of the level on the whole simplex.
@@ -426,28 +435,29 @@ def _regular_on_walls(
     corners: FloatArray,
     values: FloatArray,
     slopes: _LinearGradients,
-    rows: BoolArray,
+    is_tested: BoolArray,
     walls: tuple[FloatArray, FloatArray],
 ) -> BoolArray:
     """(n,) whether the requirement on walls is proved: where a face, an edge or a corner of a
     tetrahedron lies in walls (faces of the box), grad f . grad F > 0 for the projections of the
-    gradients onto these walls. Tetrahedra outside of the mask `rows` count as proved if they have
-    no corner on a wall, else as not proved.
+    gradients onto these walls. Tetrahedra outside of the mask `is_tested` count as proved if they
+    have no corner on a wall, else as not proved.
 
     function: f.
     corners, values: (n, 4, 3), (n, 4) the corners of the tetrahedra and the values of F there.
     slopes: the gradients of F.
-    rows: (n,) mask of the tetrahedra to be tested.
+    is_tested: (n,) mask of the tetrahedra to be tested.
     walls: the lower and the upper corner (3,) of the box.
     """
     tolerance = 1e-9 * (walls[1] - walls[0])
     on = np.stack([np.abs(corners - wall) <= tolerance for wall in walls], axis=-1)  # (n, 4, 3, 2)
-    proved = rows | ~on.any(axis=(1, 2, 3))
+    proved = is_tested | ~on.any(axis=(1, 2, 3))
+    # The six faces of the box: an axis, and 0 for the lower side or 1 for the upper one.
     planes = list(itertools.product(range(3), range(2)))
     for count in (1, 2):  # in corners of the box no point moves, and nothing is required
         for planes_chosen in itertools.combinations(planes, count):
             axes = [axis for axis, _ in planes_chosen]
-            if len(set(axes)) < count:
+            if len(set(axes)) < count:  # opposite faces have no point in common
                 continue
             in_planes = np.all([on[:, :, axis, side] for axis, side in planes_chosen], axis=0)
             free = np.ones(3)
@@ -455,15 +465,17 @@ def _regular_on_walls(
             corner_count = in_planes.sum(axis=1)
             # The part of a tetrahedron in the walls is a corner, an edge or a face: k corners.
             for k in range(1, 4):
-                entry = np.flatnonzero(((corner_count == k) & rows)[slopes.owner])
+                entry = np.flatnonzero(((corner_count == k) & is_tested)[slopes.owner])
                 if not len(entry):
                     continue
                 owner = slopes.owner[entry]
                 # The positions of the corners in the walls, which come first in this order.
                 columns = np.argsort(~in_planes[owner], axis=1, kind="stable")[:, :k]
                 part = np.take_along_axis(corners[owner], columns[..., None], axis=1)
-                start = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
-                is_regular = _proved_regular(function, part, start, slopes.slope[entry], free)
+                first_values = np.take_along_axis(values[owner], columns[:, :1], axis=1)[:, 0]
+                is_regular = _proved_regular(
+                    function, part, first_values, slopes.slope[entry], free
+                )
                 proved[owner[~is_regular]] = False
     return proved
 

@@ -223,6 +223,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         rows, side = np.flatnonzero(is_side_cut.any(axis=1)), is_side_cut.argmax(axis=1)
         side = side[rows]
         a, b, c = (faces[rows, (side + k) % 3] for k in range(3))
+        # The vertex at which the side from a to b is cut.
         p = vertex_on_edge[is_cut][position[rows, side]]
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
@@ -282,6 +283,7 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
     neighbor_pairs = [edges.paired_half_edges()]
     start = np.cumsum(edges.multiplicity) - edges.multiplicity
     for k in np.flatnonzero((edges.multiplicity > 2) & (edges.multiplicity % 2 == 0)):
+        # The half edges at this edge; half edge h is of the face h % m.
         edge_halves = edges.pairs_by_edge[start[k] : start[k] + edges.multiplicity[k]]
         is_along = pairs[edge_halves, 0] == edges.vertices[k, 0]
         third_corner = faces[edge_halves % m].sum(axis=1) - pairs[edge_halves].sum(axis=1)
@@ -311,6 +313,8 @@ def _wedges(ends: FloatArray, third: FloatArray, is_along: BoolArray) -> IntArra
     steps: IntArray = np.round(angles / _TURN).astype(np.int64) % round(1 / _TURN)
     opening_faces, wedges = list[int](), list[tuple[int, int]]()
     is_taken = np.zeros(len(third), np.bool_)
+    # Faces by their angles, and at the same angle first those that run along. In the second round
+    # the last opening faces meet the first closing ones.
     for k in 2 * np.lexsort((~is_along, steps)).tolist():  # twice around
         if is_taken[k]:
             continue

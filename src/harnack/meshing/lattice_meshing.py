@@ -160,7 +160,7 @@ def check_no_missed_parts(
         return
     start = points[rows]
     max_step = np.full(len(rows), 0.5 * size)
-    # Move points that are less than a cell from the level set onto it.
+    # Move points that are less than a cell from the level set onto it (None: there are no walls).
     x = newton_to_level(function, start, samples.select(rows), max_step, None)
     end_samples = function.sample(x)
     is_on_level = end_samples.distance < _ON_LEVEL_DISTANCE * size
@@ -567,6 +567,7 @@ def split_faces_off_level(
         off_level = np.flatnonzero(samples.distance > farthest)
         if not len(off_level):
             break
+        # Steps of at most half an edge, without walls (None).
         max_step = 0.5 * row_norms(corner[off_level, 1] - corner[off_level, 0])
         moved = newton_to_level(
             function, center[off_level], samples.select(off_level), max_step, None

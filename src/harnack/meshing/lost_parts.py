@@ -80,6 +80,7 @@ class PointsOnLevel:
         tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
             points."""
         jumps = function.field.jumps
+        # The vertices of the mesh, its faces, and more.
         mesh = None if jumps is None else jumps.mesh()
         if mesh is not None:
             return cls._on_triangles(function, mesh[0][mesh[1]])
@@ -303,12 +304,13 @@ def _thicknesses(
     """
     if isinstance(function.field, OrientedPoints):  # each point is in its own bubble
         unknown_thickness = np.full(len(points.points), np.inf)
-        return unknown_thickness, unknown_thickness > 0
+        return unknown_thickness, unknown_thickness > 0  # (the mask does not count)
     distances = spacing * _THICKNESSES
     distance_per_side: list[FloatArray] = []
     for sign in (1.0, -1.0):
         probes = points.points[:, None] + sign * distances[:, None] * points.normals[:, None]
         is_positive = function.values(probes.reshape(-1, 3)).reshape(-1, len(distances)) > 0
+        # The normals point to where the function is positive.
         has_changed = is_positive != (sign > 0)
         distance_per_side.append(
             np.where(has_changed.any(axis=1), distances[has_changed.argmax(axis=1)], np.inf)

@@ -169,6 +169,7 @@ def count_crossings(
     change = np.where(has_free_ends, value[b] - value[a], 0.0)
     if function.period is None:
         count = np.where(has_free_ends, (value[b] > 0).astype(np.int64) - (value[a] > 0), 0)
+        # All edges count as proved, and none is integrated.
         return EdgeCrossings(count, change, int(has_free_ends.sum()), 0)
     period = function.period
     change -= period * np.round(change / period)
@@ -395,8 +396,8 @@ def _roots(
     edges: (r,) the indices of the edges that have a crossing.
 
     The points are found by the secant method if the function has `secant_steps`, else by
-    Chandrupatla's method. If an end of an edge has the value `OUTSIDE_VALUE`, which stands for the
-    outside of the meshed region, the point is the middle of the edge."""
+    Chandrupatla's method. In the latter case, if an end of an edge has the value `OUTSIDE_VALUE`,
+    which stands for the outside of the meshed region, the point is the middle of the edge."""
     a, b = tets.ends[edges].T
     p, direction = points.points[a], points.points[b] - points.points[a]
     value, change = points.samples.value[a], crossings.change[edges]

@@ -100,6 +100,7 @@ def clean_and_fill(
         if not len(failing_vertices):
             return working.result(holes)
         working = working.without_ring(failing_vertices)
+        # Faces of fillings, which have no source, do not count.
         if (working.source_face >= 0).sum() < min_faces:
             raise MeshingError(f"half of the triangles would be left out: {why}")
     raise MeshingError(f"holes cannot be filled, even {_MOST_RINGS} rings wider: {why}")
@@ -141,6 +142,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         candidates.append(
             (len(boundary_edges(welded_faces)) + lost_edges, mean, welded_faces, largest_move)
         )
+    # The candidate with the fewest open edges.
     count, mean, welded_faces, largest_move = min(candidates, key=lambda candidate: candidate[0])
     if count > _MAX_OPEN_RATIO * len(faces):
         raise MeshingError(
@@ -176,6 +178,7 @@ class _WorkingMesh:
         area = row_norms(area_normals(corner))
         # Three reasons in turn: faces without an area, duplicates, and faces that intersect others.
         rows = all_faces[area > 0]
+        # The last four are for faces that are removed later.
         reasons = ("flat", "doubled", "crossing", "branching", "one-sided", "around", "inside")
         counts = dict.fromkeys(reasons, 0) | {"flat": len(faces) - len(rows)}
         _, first_of_duplicates = np.unique(

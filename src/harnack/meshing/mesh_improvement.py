@@ -157,6 +157,7 @@ def _flips_stay_near(
     middle = corner[:, 0, :2].mean(axis=1)
     points = np.concatenate([middle, *corner.mean(axis=2).transpose(1, 0, 2)])
     samples = function.sample(points)
+    # Three samples for each flip: at the middle, then at both centers, whose gradients count.
     is_near = (samples.distance <= tolerance).reshape(3, -1).all(axis=0)
     gradient = samples.gradient.reshape(3, -1, 3)[1:].transpose(1, 0, 2)
     size = np.linalg.norm(normal, axis=2) * np.linalg.norm(gradient, axis=2)
@@ -327,6 +328,7 @@ class _VertexStars:
         count: the number of all vertices of the mesh."""
         index = np.full(count, -1, np.int64)
         index[centers] = np.arange(len(centers))
+        # For each pair, the face and the place (0 to 2) of the vertex among its corners.
         face, column = np.nonzero(index[faces] >= 0)
         corners = np.stack([faces[face, (column + k) % 3] for k in range(3)], axis=1)
         return cls(centers, index[corners[:, 0]], face, corners)

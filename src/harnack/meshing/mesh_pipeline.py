@@ -384,6 +384,7 @@ def _mesh_from_signs(
             # The box itself has cut the mesh already if the clip is a box.
             made, is_intersection_free = clip_to_volume(made, volume), False
     elif volume is None and ends[1] == math.inf:
+        # Reversed, the faces look out of the solid of larger values.
         made = signed(levels[0], -1.0, False)
     else:
         # Between two levels: the points below the upper level without those below the lower one.
@@ -490,6 +491,7 @@ def _faces_alone(
         )
     facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
     function = LevelFunction(field, level, most_faces=asked.most_faces)
+    # No check of the level: the triangles are the level set. Other checks follow (False).
     return _RawMesh(surface, size, facts, function, _accept, False)
 
 
@@ -670,6 +672,7 @@ def _mesh_solid(
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            # In a single attempt: the caller tries again with smaller cells.
             made, facts = _mesh_spanning_curve(
                 function, box, error, cells, 1, asked.seed, asked.report
             )
@@ -706,6 +709,7 @@ def _mesh_solid(
         "evaluations": made.evaluations + angle_evaluations[0],
         "surfaces_with_options": made.levels,
     }
+    # (True: `mesh_solid` has checked it.)
     return _RawMesh(
         made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
     )
@@ -750,6 +754,7 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
         volume."""
         _check_level(function, surface, asked.tolerance.at(size), volume)
 
+    # (False: it is checked later, after it was cut and perhaps thickened.)
     return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
 
 
@@ -780,6 +785,7 @@ def _mesh_in_lattice(
             lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
             made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
             check_manifold(made.faces, made.vertices)
+            # (None: no volume has cut the mesh yet.)
             check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
             check_no_self_intersection(made.vertices, made.faces)
             break
@@ -850,14 +856,15 @@ class _MeshingBox:
 
 def _is_outside_inside(field: Field, ends: tuple[float, float], box: _MeshingBox) -> bool:
     """Whether the points outside of `box` belong to the solid in which f lies between two levels.
+    The box contains both level sets. So either all points outside belong to the solid or none does,
+    and the value of f at one of them decides. False if no such point is in the field's domain.
 
-    ends: the two levels. The box contains both level sets. So either all points outside belong to
-        the solid or none does, and the value of f at one of them decides. False if no such point is
-        in the field's domain."""
+    ends: the two levels."""
     center, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
     # Points around the box: its corners and the centers of its edges and faces, moved outwards.
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
     signs = signs[signs.any(axis=1)]
+    # First points well outside; then, as these may be outside of the domain, points nearby.
     points = np.concatenate([center + factor * half * signs for factor in (1.5, 1.02)])
     if field.domain is not None:
         points = points[field.domain.contains_points(points)]
@@ -880,7 +887,7 @@ def _unlimited_box(field: Field, volume: Volume | None) -> _MeshingBox:
             f"the solid on this side of the level of {type(field).__name__} reaches to infinity: "
             "choose the other side, or give a clip with bounds, such as a box"
         )
-    return _MeshingBox(*bounds, True)
+    return _MeshingBox(*bounds, True)  # the surface may end at its faces
 
 
 def _box(field: Field, levels: tuple[float, ...], volume: Volume | None) -> _MeshingBox:
@@ -946,7 +953,7 @@ def _around_curve(field: SolidAngle, extent: Volume | None, volume: Volume | Non
     if not np.isfinite(upper - lower).all():
         raise MeshingError("the clip has no bounds: give a box or a ball")
     pad = _CURVE_MARGIN * (upper - lower).max()
-    return _MeshingBox(lower - pad, upper + pad, True)
+    return _MeshingBox(lower - pad, upper + pad, True)  # the surface may end at its faces
 
 
 def _bounds_of(volume: Volume | None) -> tuple[FloatArray, FloatArray]:

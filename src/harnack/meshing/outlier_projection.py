@@ -131,7 +131,8 @@ def _project_and_split(
         vertex_on_edge[rows] = np.where(is_cut, count + position, -1).reshape(3, -1).T
     # Other faces with a far center get a vertex there, and become a fan of three.
     fan_rows = np.setdiff1d(center_rows, np.flatnonzero((vertex_on_edge >= 0).any(axis=1)))
-    # Move all three kinds of points at once: far vertices, new vertices on edges, new centers.
+    # Move all three kinds of points at once: far vertices, new vertices on edges, new centers. Each
+    # step is at most the tolerance, and there are no walls (None).
     start = np.concatenate(
         [
             vertices[moved_vertices],

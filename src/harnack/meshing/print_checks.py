@@ -188,6 +188,7 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
         MeshError: the file has no faces, or `validate_mesh` rejects the mesh.
     """
     if isinstance(part, str | os.PathLike):
+        # As for a winding number, that is, as a triangle mesh.
         read = read_geometry(cast("Any", part), "winding")
         if not isinstance(read, LoadedMesh):
             raise MeshError(f"{part}: it holds no faces, so there is nothing to print")

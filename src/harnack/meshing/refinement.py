@@ -314,6 +314,7 @@ def unrefined_midpoints(
 
     function: f - level for a field f; it is 0 on the level set.
     """
+    # Without walls, and everywhere.
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)
     return marks.middle[marks.marked]
 

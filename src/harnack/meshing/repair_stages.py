@@ -275,7 +275,7 @@ def _checked_settings(
         raise ValueError(f'keep is None, "all", "valid" or "none", not {keep!r}')
     if not is_one_of(patches, ("smooth", "harmonic")):
         raise ValueError(f'filling is "smooth" or "harmonic", not {patches!r}')
-    check_options(spacing, None, seed, 1)
+    check_options(spacing, None, seed, 1)  # (no thickness; any valid number of triangles)
     return _RepairOptions(keep, patches, tolerance, spacing, seed, report)
 
 

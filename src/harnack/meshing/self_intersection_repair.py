@@ -292,7 +292,8 @@ def _changes(
                     yield moved, *change
         change = patch.flip_edge(a, b)
         if change is not None and _is_small_change(patch, *change, length):
-            # The surface moves by the distance between the old and the new edge.
+            # The surface moves by the distance between the old and the new edge, which joins c and
+            # d. The first new face is (a, d, c).
             c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
             moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
             if moved <= length:

@@ -232,9 +232,11 @@ class SignFunction(LevelFunction):
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
             t, normal, is_on_jump = self._on_sheets(low, direction, first, last)
+            # The shortened segments need two evaluations only.
             rows = np.flatnonzero(~is_on_jump)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
         else:
+            # On the whole segments, from 0 to 1.
             t = self._roots(low, direction, t, t + 1, _MAX_EVALUATIONS)
         x = low + t[:, None] * direction
         smooth_rows = np.flatnonzero(~is_on_jump)
@@ -252,6 +254,7 @@ class SignFunction(LevelFunction):
             return x
         self.evaluations += len(x)
         if isinstance(self.field, BatchedField) and self.field.jumps is None:
+            # [1]: the gradient.
             field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
             field_gradient = self.field.gradient(x, precision=self.precision)
@@ -340,6 +343,7 @@ class SignFunction(LevelFunction):
             """The t and the normal of the first crossing of a jump surface along rays o + t d, for
             t up to limit.x; t is infinite if there is none."""
             zero = backend.Array3f(0)
+            # The place t = 0 of the ray, on no facet.
             ray_start = JumpCrossing(
                 backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), zero
             )
@@ -366,6 +370,7 @@ def _check_encloses(field: DipolePotential, level: float) -> None:
     Raises:
         MeshingError: normals face inwards, cancel each other, or the points lie in a plane.
     """
+    # `is_estimated` tells whether normals, and whether areas, were estimated.
     if field.smoothing or not field.is_estimated[1] or not level > 0:
         return
     # The values at every step-th point, at most 2000 of them.

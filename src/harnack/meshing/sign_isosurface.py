@@ -239,11 +239,12 @@ def _distances(
     if closed:
         lower, upper = lattice.lower + 2 * lattice.size, lattice.upper - 2 * lattice.size
         faces = faces[((x[faces] > lower) & (x[faces] < upper)).all(axis=(1, 2))]
-    # Every k-th face, with the smallest k for which at most 20,000 are left.
+    # Every k-th face, with the smallest k for which at most 20,000 are left (1 without faces).
     surface = TriangleMesh.without_unused_vertices(
         x, faces[:: -(-len(faces) // _MOST_MEASURED) or 1]
     )
     x, faces = surface.vertices, surface.faces
+    # (None: no volume has cut the mesh.)
     off_level, measured_count = points_off_level(function, x, faces, tolerance, None)
     # Double the distance until no point is farther.
     within, farther = tolerance, off_level
@@ -487,7 +488,7 @@ def _triangles(
     tetrahedra = Tetrahedra.of(points, corners[(positive_count > 0) & (positive_count < 4)])
     if not len(tetrahedra.corners):
         return points[:0], np.zeros((0, 3), np.int64)
-    # A value of 0 counts as below; no point is on the level.
+    # A value of 0 counts as below; no point is on the level. Gradients and radii are not used.
     is_on_level = np.zeros(len(points), np.bool_)
     sampled = TetrahedronPoints(
         points, is_on_level, LevelSamples(value, np.zeros_like(points), value)
@@ -644,6 +645,7 @@ def _toward_tangent_planes(
         fraction = row_dots(point, across) / row_dots(across, across)
         fraction = np.clip(fraction, _FROM_CORNERS, 1 - _FROM_CORNERS)
         foot = fraction[:, None] * edge
+        # From the point of the edge to the nearest point of the line.
         direction = point + row_dots(foot - point, axis)[:, None] * axis - foot
     is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
     return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), sine2
@@ -730,6 +732,7 @@ def _undo_until_valid(
     Raises:
         LocalizedMeshingError: triangles still intersect.
     """
+    # First faces that are turned over, then faces that intersect others or are folded onto them.
     x = x.copy()
     undone_count = 0
     unmoved_normals = area_normals(unmoved[faces])
@@ -745,7 +748,7 @@ def _undo_until_valid(
         x[faces[is_turned]] = unmoved[faces[is_turned]]
         undone_count += int(is_turned.sum())
     is_tested: BoolArray = np.asarray((x != unmoved).any(axis=1)[faces].any(axis=1))
-    failing = faces[:0, 0]
+    failing = faces[:0, 0]  # no indices
     for _ in range(_MOST_REPAIRS):
         failing = np.union1d(
             intersecting_faces(x, faces, is_tested), _folded_faces(x, faces, is_tested)

@@ -90,6 +90,7 @@ def _vertices(
     then the points at angle 0 of the `shift` lines above the last one, where the last lines end
     after a turn."""
     angle = 2 * math.pi * np.arange(segments) / segments
+    # The height and the radius of the last lines after a turn, where they are at angle 0 again.
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
     x, y = radii[:, None] * np.cos(angle), radii[:, None] * np.sin(angle)
@@ -105,6 +106,8 @@ def _index(line: IntArray, step: IntArray, lines: int, segments: int, shift: int
     step: the angles, as numbers from 0 to `segments` (a full turn). Line i after a full turn is
         line i + shift at angle 0.
     lines, segments: the number of lines, and of the vertices of a line in one turn."""
+    # After a full turn a line is another one, at angle 0. The points of lines beyond the last come
+    # after those of all lines.
     line, step = np.where(step == segments, line + shift, line), np.where(step == segments, 0, step)
     return np.where(line < lines, line * segments + step, lines * segments + line - lines)
 

@@ -274,7 +274,8 @@ class _Sweep:
             cosine = float(before @ after)
             if cosine <= -1 + _REVERSAL:
                 return None
-            # The rotation that takes one edge's direction to the next.
+            # The rotation that takes one edge's direction to the next (Rodrigues' formula); then
+            # what rounding leaves along the edge is removed.
             axis, u = np.cross(before, after), first_vectors[-1]
             turned = cosine * u + np.cross(axis, u) + axis * (axis @ u) / (1 + cosine)
             turned -= (turned @ after) * after
@@ -289,6 +290,7 @@ class _Sweep:
             step = 2 * math.pi / self.ring_size
             shift = round(mismatch / step)
             twist_per_edge = (mismatch - shift * step) / len(edges)
+        # (A closed polyline has one vector more: that after a round.)
         frames = [
             np.stack([u, np.cross(edge, u)]) for u, edge in zip(first_vectors, edges, strict=False)
         ]

@@ -56,6 +56,7 @@ class BranchReading(LevelReading):
         """The attribute `gaps` for f behind a jump at the point. The jump is an integer, so
         differences to periodic levels stay as they are. Differences to true levels are replaced by
         `behind`, the differences between f behind the jump and the true levels."""
+        # Rays in the mask look for true levels, all other rays for periodic ones.
         down = dr.select(self.passes_branch_level, behind.below, self.gaps.below)
         return replace(
             self.gaps,
@@ -114,10 +115,12 @@ class BranchTracker:
         starts_outside = (entry > ends[0]) & (start <= entry)
         starts_inside = state.active & ~starts_outside
         rounding = backend.machine_epsilon * (max_norm(path.origin) + start)
+        # NaN where f takes long to compute.
         value = samples.value_if_cheap(path.point(start), rounding, starts_inside)
         has_branch = starts_outside | dr.isfinite(value)
-        # VariableAccuracy scale 0 is the coarsest, which may lack the branch.
+        # The accuracy scale 0 is the coarsest, whose samples may lack the branch.
         accuracy = dr.select(has_branch, 0, backend.Float(samples.sure_accuracy))
+        # Rays that start outside begin with the branch of f = 0.
         value = dr.select(dr.isfinite(value), value, 0)
         return replace(state, accuracy_scale=accuracy, value=backend.Float(value))
 
@@ -176,21 +179,23 @@ class BranchTracker:
         level, the point is not accepted, whatever its value. If f is within its error of a periodic
         level, the point is accepted only by (1).
         """
+        # Any level serves: in case (2) f stays between two neighbors of level + n, n an integer.
         sample, level = ray_sample.sample, self.levels.values[0]
-        value, branch = sample.value - level, dr.floor(before - level)
-        in_branch = level + (branch + (value - dr.floor(value)))
+        offset, branch = sample.value - level, dr.floor(before - level)
+        in_branch = level + (branch + (offset - dr.floor(offset)))
         # The value for case (1); `in_branch` is that for case (2).
         nearest = sample.value + dr.round(before - sample.value)
         # An array of the width of `step`.
         change = 0 * step + _MAX_CHANGE
-        is_near = any_is_free(ray_sample.backward, LevelGaps(change, change), step) & (
+        # Case (1): f changes by less than a quarter on the way back, and its error is small.
+        changes_little = any_is_free(ray_sample.backward, LevelGaps(change, change), step) & (
             total_error < _MAX_ERROR
         )
         # 0 stands for no accepted point.
-        is_near &= before != 0
-        value = dr.select(is_near, nearest, in_branch)
+        changes_little &= before != 0
+        value = dr.select(changes_little, nearest, in_branch)
         shift = dr.select(sample.branch_unknown, value - sample.value, 0)
-        return replace(ray_sample, sample=sample.shifted(shift)), is_near
+        return replace(ray_sample, sample=sample.shifted(shift)), changes_little
 
     def gaps(
         self, sample: Sample, is_modulo: Mask, is_sure: Mask, total_error: Real
@@ -217,6 +222,8 @@ class BranchTracker:
         """
         periodic, true = self._periodic_levels.gaps(sample.value), self.levels.gaps(sample.value)
         near = fmax(2 * total_error, _NEAR_LEVEL)
+        # If the nearest periodic level is a true one, both differences are equal, and the second
+        # condition is False.
         passes_level = (periodic.nearest < near) & (periodic.nearest < 0.5 * true.nearest)
         # Written so that an error that is NaN counts as large.
         passes_level |= ~(total_error < _MAX_ERROR)

@@ -140,11 +140,13 @@ def attach_derivatives(
         if accuracy is not None:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
-            detail = dr.select(is_hit, backend.Float(EXACT), 0)
-            prepared = replace(prepared, field=accuracy.at(detail))
+            # Hits are sampled without truncation; other rays do not matter (0 is the coarsest).
+            scale = dr.select(is_hit, backend.Float(EXACT), 0)
+            prepared = replace(prepared, field=accuracy.at(scale))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
+            # The level minus f, and the derivative of f along the ray: Newton's step.
             offset = prepared.levels.offset_to_nearest(sample.value)
             slope = dr.dot(sample.gradient, direction)
             step = dr.select(is_hit & (slope != 0), offset / slope, 0)
@@ -177,8 +179,10 @@ def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Re
     """
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
+        # At a hit on a facet, `end.gradient` is the facet's normal.
         slope = dr.dot(end.gradient, dr.detach(d))
     x = dr.fma(prepared.backend.Array3f(t_hit), d, o)
+    # A zero with a derivative: that of the distance of a point at fixed t from the plane.
     change = dr.dot(end.gradient, x - dr.detach(x))
     return _with_derivative(end.t, change, slope, end.at_jump)
 

@@ -97,6 +97,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     there up to its error. No sample in this precision can tell such a point from the surface.
     """
     at_hit = field.evaluate(hits.position)
+    # The level nearest to f at the hit.
     level = at_hit.value + levels.offset_to_nearest(at_hit.value)
     period = levels.period
     farthest = fmax(_MAX_DISTANCE_FRACTION * hits.size, hits.distance)
@@ -119,7 +120,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             (dr.abs(offset) > error) & (dr.abs(offset) < _MAX_PERIOD_FRACTION * period),
         )
 
-    # Two axes at right angles to the gradient.
+    # Two axes at right angles to the gradient, made from an axis that is far from parallel to it.
     normal, vector = hits.normal, backend.Array3f
     axis = dr.select(dr.abs(normal.x) < 0.6, vector(1, 0, 0), vector(0, 1, 0))
     first_axis = safe_normalize(dr.cross(normal, axis))
@@ -134,6 +135,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         direction = dr.select(
             now.way < 2, hits.normal, dr.select(now.way < 4, first_axis, second_axis)
         )
+        # Of the two opposite directions along an axis, the even one comes first.
         direction = dr.select((now.way & 1) == 0, direction, -direction)
         length = dr.select(now.searches, _turning_point(now), now.distance)
         sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
@@ -166,12 +168,14 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             low_slope=dr.select(is_turning, first_slope, dr.select(is_low, slope, now.low_slope)),
             high_slope=dr.select(is_high, slope, now.high_slope),
             searches=keeps_way,
+            # A search that has ended in vain is not begun again.
             may_turn=now.may_turn & ~(now.searches & ~goes_on),
             sample_count=now.sample_count + 1,
             is_found=is_seen,
             active=now.active & ~is_seen & (distance <= farthest),
         )
 
+    # The sample at the hit may show a side of the level. No interval is known yet (zeros).
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
         hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0),

@@ -427,6 +427,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
 
     def compute(o: Vec3, d: Vec3, near: Real, far: Real) -> dict[str, Any]:
         """Return the arrays of `Hits` by name, for rays o + t d from t = near to t = far."""
+        # Of the three results, [1] is the `Hits`.
         return vars(_first_hits(prepared, o, d, near, far)[1])
 
     directions = to_numpy(lanes["d"])
@@ -478,7 +479,7 @@ def _compare_hits(
     is_undecided = np.maximum(expected.status, actual.status) == int(RayStatus.OUT_OF_STEPS)
     may_differ = is_undecided | (hit & (cosine < _GRAZING))
     if (differs & ~may_differ).any() or differs.sum() > _MAX_OUTLIERS * len(differs):
-        k = int(np.flatnonzero(differs)[0])
+        k = int(np.flatnonzero(differs)[0])  # the first of these rays, as an example
         return (
             f"{differs.sum()} of {len(differs)} rays end otherwise, such as ray {k} of the sample: "
             f"{RayStatus(expected.status[k]).name} here, {RayStatus(actual.status[k]).name} there"
@@ -506,6 +507,7 @@ def _compare_hits(
     if normal_changes.size and np.quantile(normal_changes, 0.9) > _MAX_NORMAL_CHANGE:
         return "normals differ"
     counts, actual_counts = (result.evaluations.astype(np.float64) for result in (expected, actual))
+    # (2 more, so that a few rays may differ, too.)
     if np.abs(actual_counts - counts).sum() > _MAX_COUNT_CHANGE * (counts + 1).sum() + 2:
         return "rays take another number of evaluations"
     return ""
@@ -517,6 +519,7 @@ def _no_hits(rays: RayBatch) -> Hits:
     number, vector = dr.zeros(backend.Float, 0), dr.zeros(backend.Array3f, 0)
     count = dr.zeros(backend.UInt32, 0)
     index = dr.zeros(backend.Int32, 0)
+    # In the order of the attributes: t, position, normal, value, evaluations, status, ...
     hits = Hits(number, vector, vector, number, count, count, index, number)
     if rays.is_numpy:
         return _as_numpy(hits, 0)

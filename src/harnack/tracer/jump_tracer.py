@@ -145,10 +145,13 @@ class JumpTracer:
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         o, d = self.path.origin, self.path.direction
-        # A little before the start, so that a facet at the very start is crossed.
+        # A little before the start, so that a facet at the very start is crossed (1e-30: also if
+        # the start is 0).
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
         offset = real(self.jumps.initial_offset(o, d, before, state.active))
+        # The place from which facets are looked for: no facet, no jump, no normal.
         start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
+        # Only rays that look for crossings of the level have a contact.
         reported = None if state.contact is None else count(NO_FACET)
         return JumpTraceState(offset, start, state, reported)
 
@@ -294,7 +297,8 @@ class JumpTracer:
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
             """Add the next crossing of a facet to the sums, if it is at the same point, and return
             the new sums."""
-            # The field looks for the next crossing after the place (t, facet) of the last one.
+            # The field looks for the next crossing after the place (t, facet) of the last one. The
+            # jump and the normal of that one are not used.
             crossing = self._next(
                 JumpCrossing(now.t, now.last, 0.0, first.normal), limit, now.active
             )
@@ -303,6 +307,7 @@ class JumpTracer:
             is_same_point = (
                 now.active & (crossing.facet != NO_FACET) & ((crossing.t == first.t) | is_parallel)
             )
+            # Of the facets at which f jumps up (down), the first one is kept.
             new_up = is_same_point & (crossing.jump > 0) & (now.up == NO_FACET)
             new_down = is_same_point & (crossing.jump < 0) & (now.down == NO_FACET)
             return _CoincidentJumps(
@@ -332,9 +337,12 @@ class JumpTracer:
         )
         total = loop_while_active(start, add_next, "together")
         # The first facet whose jump has the sign of the sum gives index and normal.
-        up, down = total.jump > 0, total.jump < 0
-        facet = dr.select(up, total.up, dr.select(down, total.down, first.facet))
-        normal = dr.select(up, total.normal_up, dr.select(down, total.normal_down, first.normal))
+        rises, falls = total.jump > 0, total.jump < 0
+        facet = dr.select(rises, total.up, dr.select(falls, total.down, first.facet))
+        normal = dr.select(
+            rises, total.normal_up, dr.select(falls, total.normal_down, first.normal)
+        )
+        # The place (t, facet) from which the ray goes on; its jump and normal are not used.
         behind = JumpCrossing(total.t, total.last, first.jump, first.normal)
         is_unclear = total.folded & (total.jump == 0)
         # Only if rounding is no small part of the ray.

@@ -244,6 +244,6 @@ def validate_component_cells(largest: object) -> int:
         across = operator.index(largest)  # pyright: ignore[reportArgumentType]
     except TypeError:
         raise TypeError(wrong) from None
-    if across and not 8 <= across <= 512:
+    if across and not 8 <= across <= 512:  # 0 means False
         raise ValueError(wrong)
     return across

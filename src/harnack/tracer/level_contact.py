@@ -208,15 +208,18 @@ class Contact:
     comes within the tolerance of a level until f has left the tolerance around it.
 
     side: on which side of the level the ray came: 1 if f was larger, -1 if smaller, 0 if all
-        samples so far were at the level at which the ray started. If the ray is not in contact, it
-        only matters whether side is 0.
+        samples so far were at the level at which the ray started. While the ray is not in contact,
+        only whether `side` is 0 has a meaning.
     is_touching: whether the ray is in contact, or may still be.
     root: the ray parameter at which f last took the level, between two samples on different sides
-        of it. If the contact began beyond the level, the parameter at which it began.
+        of it. If there are no such samples since the contact began (the ray only grazes the level,
+        or its first sample within the tolerance was on the far side already), the parameter at
+        which the contact began.
     gradient: (3,) gradient of f at the root.
     tolerance_excess: by how much |f - level| at the root may exceed what the tolerance allows,
         because of rounding.
-    before, after: the ray parameters of the two samples around the root, or the root itself.
+    before, after: the ray parameters of the two samples around the root; both are the root itself
+        if it is the parameter at which the contact began.
     band: the tolerance in value around the level at the last sample, which f must leave to end the
         contact (`Hysteresis.band`).
     """
@@ -421,6 +424,7 @@ class Hysteresis:
         # below (side < 0) may go to the moved level above it, and back to the next level below.
         below = dr.select(contact.side < 0, far_gap, band)
         above = dr.select(contact.side > 0, far_gap, band)
+        # f minus the moved level below it, and the moved level above it minus f; not negative.
         return LevelGaps(
             dr.select(contact.is_touching, fmax(below + offset, 0), gaps.below),
             dr.select(contact.is_touching, fmax(above - offset, 0), gaps.above),
@@ -594,6 +598,7 @@ def refine_crossing(
     # 1 if f is larger than the level before the crossing. (Contact has the side after it.)
     side = -contact.side
     count = dr.uint32_array_t(type(contact.root))
+    # Intervals are halved down to this fraction of the size of coordinates: a few roundings.
     smallest = 4 * float(dr.epsilon(type(contact.root)))
 
     def bisect(now: _Bisection) -> _Bisection:

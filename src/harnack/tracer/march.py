@@ -462,6 +462,7 @@ class March:
             )
             contact_arguments = contact, value, self.levels.gaps(value), trial.band
             gaps = self.hysteresis.gaps(*contact_arguments)
+            # Trial steps aim at a point before the moved levels: at a part of the way to them.
             aim_gaps = self.hysteresis.gaps(*contact_arguments, CONTACT_AIM)
             return _Arrival(is_hit, gaps, aim_gaps, contact, value, jump)
         value = trial.value
@@ -588,6 +589,7 @@ class March:
         """
         sample, p = ray_sample.sample, path.point(t)
         tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+        # A bound of the rounding of the point.
         slack = 8 * self.backend.machine_epsilon * size
         reach = fmax(tolerance, 2 * slack)
         is_proved = gaps.nearest <= self.tolerance.value
@@ -819,7 +821,8 @@ class March:
         contact: the contact with a level after the trial point; None if rays end at levels.
         is_hit: mask of trial points that are hits.
         """
-        # After a step of zero, the next enclosures need reach only a third as far: bisection.
+        # After a step of zero, the next enclosures need reach only a third as far: bisection. On a
+        # ray without an end, an infinite reach becomes one of some sizes of the coordinates.
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
         reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)

@@ -115,6 +115,7 @@ class PixelCones:
             _START_MARGIN if prepared.field.variable_accuracy is None else _START_MARGIN_APPROXIMATE
         )
         # The march ends a small margin outside of the cover: the tolerance grows with the cone.
+        # (`distance` and `value` of the tolerance are 0, `per_length` is the margin.)
         tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
         rule = PlainLevels(prepared.levels)
         march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
@@ -150,9 +151,10 @@ class PixelCones:
             return _CoverState(t, height, slope, step, count, last.active & ~is_over)
 
         height, slope = self._height(now.value, now.gradient, begin, side, level)
-        first = _next_step(height, slope, real(0), _MAX_FIRST_STEP * self.radius * begin)
-        none = backend.UInt32(0)
-        passage = _CoverState(begin, height, slope, first, none, is_hit & (height > -1))
+        # With the second derivative 0, as none is known yet.
+        first_step = _next_step(height, slope, real(0), _MAX_FIRST_STEP * self.radius * begin)
+        no_samples = backend.UInt32(0)
+        passage = _CoverState(begin, height, slope, first_step, no_samples, is_hit & (height > -1))
         passage = loop_while_active(passage, sample_once, "harnack cover")
         return is_hit & ~(passage.height <= -1), now.evaluations + passage.sample_count
 
@@ -197,6 +199,8 @@ class PixelCones:
         real = self.prepared.backend.Float
         start, end = real(0), real(dr.inf)
         if self.bounding_balls is not None and self.prepared.volume is not None:
+            # Around `middle`, a ball of radius `depth` lies in the extent, and a ball of radius
+            # `size` contains it.
             middle, depth, size = self.bounding_balls
             # The distance at which a cone can be last near the extent, with a margin for its radius
             # there.
@@ -205,6 +209,7 @@ class PixelCones:
             o = (self.origin - middle) / factor + middle
             start, end = self.prepared.volume.clip(o, self.direction, start, end)
             start, end = start * factor, end * factor
+        # Outside of the region f must not be evaluated.
         if self.prepared.region is not None:
             start, end = self.prepared.region.clip(self.origin, self.direction, start, end)
         return real(start), real(end)

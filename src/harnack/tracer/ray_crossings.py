@@ -148,6 +148,7 @@ def find_crossings(
         if tracer is None or now.sheets is None:
             after = march.advance(prepared.field, path, end, now.now)
         else:
+            # The tracer's own state includes that of the march.
             walk = tracer.advance(now.sheets)
             next_state = _SearchState(None, walk, now.count)
             after, facet = tracer.finish(walk)
@@ -344,7 +345,8 @@ def trace_crossings(
     t, end = found.t, found.end
     if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
-            # The crossings as if each were the end of a ray of its own.
+            # The crossings as if each were the end of a ray of its own. The attributes that are
+            # zero (`value`, `tolerance_excess` and `evaluations`) are not used.
             status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
             zero = dr.zeros(backend.Float, dr.width(t))
             ends = MarchResult(t, zero, found.gradient, zero, zero, status, found.sheet, found.side)

@@ -116,6 +116,7 @@ class SteepPlace:
         p, value = path.point(t), sample.value
         real = cast("Any", type(t))
         slack = 8 * float(dr.epsilon(real)) * (max_norm(path.origin) + t)
+        # On an infinite length nothing is bounded.
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
         at_point = values_between(field, p, p, slack)
         on_path = values_between(field, p, path.point(t + ahead), slack)
@@ -155,9 +156,9 @@ class SteepPlace:
         """Return the length `ahead` of the ray if f is proved to change on it by less than `gaps`,
         else 0.
 
-        gaps: the differences between f and the next levels below and above. They need not be those
-            of `free`: a ray that looks for crossings moves the level that it has reached
-            (`Hysteresis`).
+        gaps: the differences between f and the next levels below and above. These levels need not
+            be those of which the attribute `free` is proved: for a ray that looks for crossings,
+            the level that it has reached counts as lying a little farther off (`Hysteresis`).
         """
         return dr.select((self.fall < gaps.below) & (self.rise < gaps.above), self.ahead, 0)
 
@@ -330,6 +331,7 @@ def beyond(
             active=active,
         )
 
+    # The search begins at p (`inner` = 0), in the interval from 0 to `reach`.
     begin = _SearchState(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
         backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),

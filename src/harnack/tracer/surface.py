@@ -101,7 +101,7 @@ class Surface:
             "section": section, "side": side, "largest": validate_component_cells(largest),
         }  # fmt: skip
         for name, value in values.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, value)  # the dataclass is frozen
         field.validate_levels(self.level_values)
         if field.jumps is not None and field.period is not None:
             raise ValueError("a field with jumps must be real-valued: its period must be None")

@@ -374,7 +374,7 @@ class SurfaceTracer:
             None,
         )
         contact, evaluations = end.contact, end.evaluations
-        # Hits require a crossing: t is its root.
+        # If hits require a crossing, t is its root.
         if contact is not None:
             is_hit = end.status == int(RayStatus.HIT)
             root, gradient_at_root, extra_evaluations = self.refined_crossings(
@@ -386,7 +386,7 @@ class SurfaceTracer:
             excess, side = dr.select(is_hit, contact.tolerance_excess, 0), contact.side
         t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
         patch = None
-        if self.field.patches is not None:
+        if self.field.patches is not None:  # the index is that of a patch, and no facet was hit
             facet, patch = self.backend.UInt32(NO_FACET), facet
         return MarchResult(
             t, end.value, gradient, excess, evaluations, end.status, facet, side, patch
@@ -430,9 +430,11 @@ class SurfaceTracer:
         """
         backend, real = self.backend, self.backend.Float
         path = Ray(backend.Array3f(o), backend.Array3f(d), self.proofs)
+        # Rays that are not active get an empty interval.
         t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
         start, end = self.clip(path.origin, path.direction, t_min, t_max)
         has_jumps = self.field.jumps is not None
+        # The functions that continue f beyond its jumps may have samples of several accuracies.
         has_detail = self.field.variable_accuracy is not None or has_jumps
         hysteresis = None
         if crosses:

@@ -248,6 +248,8 @@ class TracedSurface:
         """Return the grid of cells with a mark on those that may contain a level of the surface;
         None if no cells are known. If only the largest component is traced, only its cells are
         marked."""
+        # `largest` is a number of cells, 0 for all components. Results are kept for this field,
+        # these levels and a key; the key has what else they depend on.
         if not self.largest:
             return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
@@ -285,6 +287,7 @@ class TracedSurface:
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
         field, known_volume = self.evaluator(backend), None
+        # No level may be nearly an integer.
         if field.modulo_one is not None and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
         ):
