@@ -238,8 +238,9 @@ def test_long_edges_of_a_coil_need_to_be_integrated() -> None:
     rng = np.random.default_rng(0)
     p = rng.uniform(-1, 1, (4000, 3)) * [1.2, 1.2, 0.8]
     q = p + rng.normal(size=p.shape) * 0.2
-    exact = field.continuous_change(p, q)
-    assert exact is not None
+    assert field.boundary is not None
+    assert field.boundary.continuous_change is not None
+    exact = field.boundary.continuous_change(p, q)
     value = field.value(p, precision="double"), field.value(q, precision="double")
     wrapped = value[1] - value[0]
     wrapped -= PERIOD * np.round(wrapped / PERIOD)
@@ -275,8 +276,10 @@ def test_reaches_are_proved() -> None:
     samples = function.sample(x)
     d = rng.normal(size=x.shape)
     d /= np.linalg.norm(d, axis=1)[:, None]
-    change = field.continuous_change(x, x + samples.quarter_period_radius[:, None] * d)
-    assert change is not None
+    assert field.boundary is not None
+    assert field.boundary.continuous_change is not None
+    end = x + samples.quarter_period_radius[:, None] * d
+    change = field.boundary.continuous_change(x, end)
     assert np.abs(change).max() <= math.pi
     assert np.abs(change).max() > 0.55 * math.pi
 
