@@ -398,6 +398,7 @@ class OperationCounter(FormulaNumber):
         """The product of this number and another one. The result counts as a sum of squares if both
         factors are the same number, or if one is a sum of squares and the other a positive
         constant."""
+        # (`is_square` of a constant says that it is not negative.)
         is_scaled = self.is_constant or other.is_constant
         is_square = other is self or (is_scaled and self.is_square and other.is_square)
         size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate

@@ -313,6 +313,8 @@ class BranchPointEnclosure(Enclosure):
 
         The path leaves the disk of radius r at the length closest_parameter + sqrt(r^2 -
         closest_distance^2) of its projection; so the free length is at most that, divided by speed.
+        In the code w, r, C, alpha, L and v are those of the proof: y = |h - c| at the start falls
+        at most at the rate v, and w = y - (|f| - gap).
         """
         gap_towards_zero = dr.select(self.is_positive, gaps.below, gaps.above)
         gap_away = dr.select(self.is_positive, gaps.above, gaps.below)

@@ -93,6 +93,7 @@ class LipschitzEnclosure(ParabolaEnclosure):
         if not isinstance(promise, Lipschitz):
             return None
         constant = _nan_if_negative(promise.constant)
+        # Second derivatives of 0: both parabolas are lines.
         return cls(SlopeRange(-constant, constant), 0.0, 0.0, promise.radius)
 
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.

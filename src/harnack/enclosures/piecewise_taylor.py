@@ -158,4 +158,5 @@ class PiecewiseTaylorEnclosure(Enclosure):
         by_parabola = (curved + linear) + epsilon * (dr.abs(curved) + dr.abs(linear))
         rise = fmin(by_parabola, max_slope * length + epsilon * dr.abs(max_slope * length))
         slope = dr.fma(curvature, length, slope)
+        # The slope at the end is rounded up.
         return dr.fma(0.25 * epsilon, dr.abs(slope), slope), reach, gap - rise

@@ -88,6 +88,7 @@ class PromiseCase:
             ranges = -promise.lower, promise.upper
             ends = promise.laplacian_lower, promise.laplacian_upper
             return kind.from_ranges(promise.radius, ranges, ends, slopes)
+        # f(p) = 0, without an error.
         return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
@@ -543,7 +544,8 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
     t = (1 - tolerance) * length[:, None] * fractions
     with np.errstate(all="ignore"):
         movement = trial.movement(t)
-        # An upper bound of how much rounding of its inputs changes a function.
+        # An upper bound of how much rounding of its inputs changes a function: the growth in the
+        # direction of a mass at the pole (latitude 1), in the highest dimension.
         q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
         growth = kernel_difference(q, 1.0, 4) + 1
     rounding = 0.0

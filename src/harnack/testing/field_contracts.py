@@ -147,6 +147,7 @@ def proved_free_lengths(
     below, above = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
     sample = field.prepare(backend).sample_ray(ray, backend.Float(0), length, length)
     proofs = sample.forward if forwards else sample.backward
+    # Adding 0 times an array makes one of a single number.
     steps = to_numpy(longest_free_length(proofs, LevelGaps(below, above)) + 0 * below)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 

@@ -106,6 +106,7 @@ class FourierSeries(Field):
         _check_terms(checked.shape)
         if not np.isfinite(checked).all():
             raise ValueError("coefficients must be finite numbers")
+        # Entry 0 is the constant term.
         if not np.any(checked.ravel()[1:]):
             raise ValueError("the series is constant: it has no level sets")
         self.coefficients = checked
@@ -254,6 +255,7 @@ class FourierSeries(Field):
         points_on_surface = points_on_surface[
             difference <= _CONVERGED * float(self._size.max()) * slope
         ]
+        # On the surface the series has the value `level`.
         return points_on_surface, (
             _values(self._source, points_on_surface) if len(points_on_surface) else np.zeros(0)
         ) - level
@@ -303,6 +305,7 @@ class FourierSeries(Field):
             dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
         ]
         error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
+        # Entry 0 of `rounding` is for the value, entry 1 for the gradient.
         error = roundoff * (error + series.rounding[0])
         move_length = dr.norm(series.backend.Array3f(*moves))
         # A move of the point changes the gradient by at most the bound of second derivatives times

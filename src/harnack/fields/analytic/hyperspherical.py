@@ -97,6 +97,7 @@ class _OrderTerm:
         """
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
+        # The second and the third are the n and the k of C_n^k.
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
 
     def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
@@ -263,6 +264,7 @@ class HypersphericalHarmonic(Field):
         zero = 0 * p.x
         value, gradient_sum, radial_sum = zero, type(p)(0), zero
         error, gradient_error = zero, zero
+        # The roundings of a term: a few for its products, and one for each sum over the parts.
         operations = len(self._orders) + 8.0
         for term in self._orders:
             # C(w), C'(w) and C''(w)
@@ -329,10 +331,12 @@ class HypersphericalHarmonic(Field):
         for fraction in _BALL_RADII:
             # By the chain rule, with the smallest 1 + |q|^2 of the ball (see the class).
             min_square = self._min_square(square, fraction)
+            # It is negative for l = 0, where f is constant; hence the maximum with 0 below.
             second = (4 * (l - 1) / min_square + 4 / dr.sqrt(min_square)) / min_square
             promises.append(
                 TaylorRemainder(fmax(max_gradient * second, 0), self._radius(square, fraction))
             )
+        # In all of space 1 + |q|^2 is at least 1.
         return [*promises, TaylorRemainder(0 * square + max(max_gradient * 4.0 * l, 0.0), dr.inf)]
 
     def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:

@@ -433,7 +433,11 @@ class Gyroid(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the three products of a sine and a cosine of the class."""
+        """Set up the sum of the three products sin X cos Y, sin Y cos Z and sin Z cos X.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (WaveProduct(1.0, x=s, y=c), WaveProduct(1.0, y=s, z=c), WaveProduct(1.0, z=s, x=c))
@@ -454,7 +458,11 @@ class SchwarzP(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the three cosines of the class."""
+        """Set up the sum of the three cosines cos X, cos Y and cos Z.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         c = cosine_factor(_wavenumber(cell))
         super().__init__(
             cell, (WaveProduct(1.0, x=c), WaveProduct(1.0, y=c), WaveProduct(1.0, z=c)), domain
@@ -479,7 +487,12 @@ class SchwarzD(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the four products of sines (s) and cosines (c) of the class."""
+        """Set up the sum of the four products s s s, s c c, c s c and c c s, where s and c are the
+        sines and cosines of X, Y and Z.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (

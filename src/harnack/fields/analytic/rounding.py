@@ -116,6 +116,7 @@ class HarmonicRounding:
                     terms[i, degree - i] = terms.get((i, degree - i), 0.0) + factor * constant
             underflow += 2.0 + factor * _underflow(l, m)
         a, b, c, d = (AxialBound.of(terms) for terms in tables)
+        # A pair for the value and one for the gradient: near the z axis, and anywhere.
         return cls((a, b), (c, d), underflow)
 
     def value_error(self, rho: Real, r: Real) -> Real:
@@ -181,6 +182,7 @@ def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
     cosine, sine = polar_samples(_SAMPLES)
     total = q_error + (3 + addition_count + _complex_power_error(m)) * abs_q
     if is_divided:
+        # |q_(l-1)| of the orders m + 1 and m.
         at_next, at_lower = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
         # 3u (rho |f_rho| + |z f_z|), by the derivatives of Q rho^m.
         total = total + 3 * (
@@ -284,6 +286,7 @@ class WaveRounding:
         """Compute the bounds of the rounding errors that `evaluate_terms` makes when it sums these
         terms of waves."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
+        # Each list has four numbers: a constant, and the factors of |x|, |y| and |z|.
         value, gradient, total_slopes, hessian = ([0.0] * 4 for _ in range(4))
         value_sum, slope_sum, second_sum = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
@@ -301,6 +304,7 @@ class WaveRounding:
             partial_sums = (
                 (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
             )  # the first sum is exact
+            # The added 2 and 6 are roundings of the factors that differentiation adds.
             value[0] += amplitude * (angle_error + other_errors) + partial_sums[0]
             gradient[0] += amplitude * norm * (angle_error + other_errors + 2) + partial_sums[1]
             hessian[0] += second_size * (angle_error + other_errors + 6) + partial_sums[2]
@@ -322,6 +326,7 @@ class WaveRounding:
         gradient: the computed gradient at p.
         """
         abs_p = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
+        # Entry 0 of a bound is a constant, entries 1 to 3 are factors of |x|, |y| and |z|.
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
             if self.move[axis] > 0:

@@ -305,7 +305,11 @@ class WaveBounds:
         curvature = float(np.linalg.eigvalsh(matrix)[-1]) * margin
         lengths = np.linalg.norm(wave_vectors, axis=1)
         value = float(absolute_amplitudes.sum()) * margin
+        # The second bound: by Cauchy-Schwarz, (sum A_i |k_i . v|)^2 is at most sum A_i times sum
+        # A_i (k_i . v)^2.
         gradient = min(float(absolute_amplitudes @ lengths) * margin, math.sqrt(value * curvature))
+        # The last one bounds third derivatives: their terms are those of second derivatives, each
+        # times at most the largest |k_i|.
         return cls(
             tuple(float(v) for v in lengths),
             tuple(float(v) for v in absolute_amplitudes),

@@ -346,6 +346,7 @@ class _BlobDeviceData:
             None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
+            # `max_path_length`: twice the diagonal of the blobs' box.
             dr.opaque(backend.Float, 2 * float(np.linalg.norm(upper - lower))),
         )
 
@@ -500,7 +501,7 @@ def _checked(
         c[order],
         r[order],
         w[order],
-        np.unique(g[order], return_inverse=True)[1],
+        np.unique(g[order], return_inverse=True)[1],  # the groups' numbers from 0 without gaps
     )
 
 

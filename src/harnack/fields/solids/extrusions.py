@@ -204,6 +204,7 @@ class Extrusion(Solid):
         end_distance = dr.abs(p.z - half) - half
         # f, and its derivatives by the two distances.
         value, side_weight, end_weight = _corner(side.value, end_distance)
+        # The derivative of |z - half| by z is the sign of z - half.
         vertical = dr.mulsign(end_weight, p.z - half)
         gradient = gradient * side_weight + cast("Any", type(p))(0, 0, vertical)
         error = side.error + 8 * epsilon * (dr.abs(p.z) + half)

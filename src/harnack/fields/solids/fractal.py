@@ -269,6 +269,7 @@ class FractalNoise(FormulaSolid):
                 axis if isinstance(axis, Jet) else jets[0].coerce(axis) for axis in (x, y, z)
             ]
             return self._ranges(coordinates)
+        # The value of the sum of all octaves, the only entry of the list.
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:

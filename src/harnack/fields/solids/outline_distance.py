@@ -219,6 +219,7 @@ class OutlineEdges:
             # A near chain has `count` edges to visit. A far one has 0, and its box is already in
             # the state.
             count, state = query.with_chain(record, max_distance, state)
+            # Entry 6 of the record is the index of its first edge.
             first_edge, count = type(i)(record[6]), type(i)(count)
 
             def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
@@ -314,7 +315,8 @@ class _OutlineQuery:
         within which some chain must have a point. The result is the smaller of the state and that
         square for one more chain.
 
-        row: the record of the chain, which begins with its box.
+        row: the record of the chain, which begins with its box: lowest x, lowest y, highest x,
+            highest y.
         """
         (min_square,) = state
         near_x, far_x = self._distances_from_ends(self.x, row[0], row[2])
@@ -340,7 +342,8 @@ class _OutlineQuery:
         must be visited, and the state stays. If it is farther away, the number is 0, and the box is
         added to the state in place of the edges.
 
-        row: the record of the chain.
+        row: the record of the chain: its box (lowest x, lowest y, highest x, highest y), y of its
+            first and of its last vertex, the index of its first edge, and the number of its edges.
         limit: a distance within which the nearest edge lies.
         state: the state of the loop before, whose members the class docstring lists.
         """

@@ -200,6 +200,8 @@ class Thread(Solid):
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)
+        # In this order: f, its error, r = |(x, y)|, half the derivative of r^2 along the ray, the
+        # squared length of (d.x, d.y), the radius of the cylinder, the Lipschitz constant.
         cylinder = OutsideCylinderEnclosure(
             ray_sample.sample.value, ray_sample.sample.value_error,
             dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)), dr.fma(p.x, d.x, p.y * d.y),

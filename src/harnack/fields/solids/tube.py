@@ -272,6 +272,7 @@ class Tube(Solid):
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
+            # The last argument, `back`, is not used.
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
         # If `ahead` is infinite, the inner knots are fractions of another length.
         endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
@@ -281,6 +282,7 @@ class Tube(Solid):
         slope = dr.dot(sample.gradient, path.direction)
         # A distance grows no faster than the length.
         max_slope = fmin(slope + sample.gradient_error, 1.0)
+        # 4.0: the next sample asks for enclosures up to four times the length of this step.
         return RaySample(
             sample, (TangentEnclosure(distance, max_slope, knots, bounds),), (), slope, 4.0
         )
@@ -679,6 +681,9 @@ class _Segment(Field):
         Lipschitz constant 1, and a bound of second derivatives on a ball."""
         backend, row = self._boxes.backend, self._row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
+        # The record: the start of the segment (0 to 2), the radius (3), the vector from the start
+        # to the end (4 to 6), and 1 / length^2 (7). Positions are relative to the center of the
+        # boxes.
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
         # The position of the segment's point nearest to p, as a fraction of the segment; and the
