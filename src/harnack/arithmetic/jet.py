@@ -444,8 +444,8 @@ class Jet(FormulaNumber):
         """
         if start is None:
             return self
-        # The range of the change since the start of the piece. A piece has one variable, the length,
-        # so that derivatives have the index 0.
+        # The range of the change since the start of the piece. A piece has one variable, the
+        # length, so that derivatives have the index 0.
         rise = range_times_length(self.first_derivatives[0], width)
         first = self.first_derivatives[0]
         if self.second_derivatives:

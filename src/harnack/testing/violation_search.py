@@ -85,6 +85,7 @@ class FieldSamples:
 
     def subset(self, rows: BoolArray) -> FieldSamples:
         """The samples at some of the points, given by a mask or by indices."""
+        # `map_numbers` also passes the exponents of each number's unit, which are not used here.
         return FieldSamples(
             self.value[rows],
             self.gradient[rows],
@@ -110,6 +111,7 @@ def sample_field(
     # In one kernel for all of them.
     dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers)
 
+    # (`map_numbers` also passes the exponents of each number's unit.)
     promises = tuple(
         promise.map_numbers(lambda number, _, __: _to_lanes(number, n))
         for promise in sample.all_promises

@@ -300,7 +300,8 @@ class FourierSeries(Field):
         series = self._on(p)
         value, gradient = series.value(p)
         roundoff = float(dr.epsilon(type(value))) * _SECOND_ORDER
-        # The rounding of p - lower, times pi/size, moves the point.
+        # The rounding of an angle, (p - lower) pi/size, moves the point: three roundings of p -
+        # lower (of the difference, of pi/size and of the product), and that of `lower`.
         moves = [
             dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
         ]
@@ -438,6 +439,8 @@ def _rounding(coefficients: FloatArray, size: FloatArray) -> tuple[float, float]
     size: (3,) the lengths of the box's sides.
     """
     i, j, k = np.indices(coefficients.shape)
+    # Of a term: its angles are at most i pi, j pi and k pi; 2 for each of three sines or cosines, 1
+    # for the coefficient, and i + j + k + 3 sums.
     roundings = (i + j + k) * (math.pi + 1) + 10
     abs_coefficients = np.abs(coefficients)
     slopes = [

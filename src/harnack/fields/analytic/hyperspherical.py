@@ -329,7 +329,10 @@ class HypersphericalHarmonic(Field):
         max_gradient = l * self._range.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
-            # By the chain rule, with the smallest 1 + |q|^2 of the ball (see the class).
+            # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed
+            # 2/Q and has a second derivative of the length 4/Q^1.5; on S^3 the gradient of P is at
+            # most l M and its Hessian l (l-1) M, where M is the largest |P|. So second derivatives
+            # are at most M l (4 (l-1)/Q^2 + 4/Q^1.5), with the smallest Q of the ball.
             min_square = self._min_square(square, fraction)
             # It is negative for l = 0, where f is constant; hence the maximum with 0 below.
             second = (4 * (l - 1) / min_square + 4 / dr.sqrt(min_square)) / min_square
@@ -346,8 +349,9 @@ class HypersphericalHarmonic(Field):
 
         square: |p|^2.
         """
-        # By the chain rule, as in the class, with bounds of S(y) C(w) at all points within the
-        # chord.
+        # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed 2/Q
+        # and has a second derivative of the length 4/Q^1.5. Derivatives of S(y) C(w) are bounded at
+        # all points of S^3 within a chord.
         axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
         center_order = min(term.j for term in self._orders)
         if center_order < 3:
@@ -396,7 +400,9 @@ class HypersphericalHarmonic(Field):
         position = dr.dot(p, path.direction)
         l, sqrt_square = self.degree, dr.sqrt(square)  # noqa: E741
         bounds = self._range
-        # Two bounds of |f_aa|, the second derivative by the angle on the circle.
+        # Two bounds of |f_aa|, the second derivative by the angle on the circle. By the chain rule,
+        # as the circle has the radius 1/c with c^2 = `square`; and by Bernstein's inequality, as f
+        # is a trigonometric polynomial of degree l of the angle.
         bernstein_bound = l * l * 0.5 * (bounds.high - bounds.low)
         second = fmin(
             bounds.largest * l * ((l - 1) / square + 1 / sqrt_square), bernstein_bound

@@ -116,6 +116,7 @@ class ExtensionBounds:
         length_unit = 1 / math.sqrt(
             float(amplitudes**2 @ wavenumbers**2) / float(amplitudes @ amplitudes)
         )
+        # Radii from 0.02 to about 7 length units.
         steps = (length_unit * 0.02 * 1.02**n for n in range(300))
         radii = [
             r for r in steps if r * float(wavenumbers.max()) < 30.0
@@ -168,7 +169,9 @@ class ExtensionBounds:
 
     def _max_descent(self, f: Real, rise: Real) -> Real:
         """An upper bound of -F on the ball of R^4 about p, where F is the harmonic extension of f
-        to four dimensions. With -f in place of f, it is a bound of F. The class has the proof.
+        to four dimensions. With -f in place of f, it is a bound of F. With x = |y-p|/R and the
+        numbers alpha and E (`spread`), -F is at most h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2)
+        E where Dx > f, and at most Dx - f + (1-x^2) E elsewhere; the class has the proof.
 
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R at all points y of space in the
@@ -296,8 +299,9 @@ class EigenfunctionSum(Field):
             ),
         )
         alternatives = (self._extension.ball(value, gradient_norm_bound), lipschitz)
-        # The effects of the gradient's rounding: E^2/(2 h H) for Taylor's formula, and the rest of
-        # E R for the harmonic ball.
+        # The effects of the gradient's rounding error E: E^2/(2 h H) for Taylor's formula, with the
+        # bound H of second derivatives and h = `_SLOPE_SHARE`; and for the harmonic ball of radius
+        # R the part of E R that the proofs on balls do not allow for themselves.
         error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
         error += fmax(gradient_error * self._extension.radius - self._rounding_bound * epsilon, 0)
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)

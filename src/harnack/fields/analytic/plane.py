@@ -397,6 +397,7 @@ class LevelCurves(Field):
             second_bound = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (
                 1 + 1e-4
             )
+            # By Taylor's formula.
             change = (gradient_norm * radius + 0.5 * second_bound * radius * radius) * (1 + 1e-5)
             promises += [
                 TaylorRemainder(second_bound, radius),

@@ -165,6 +165,7 @@ class HarmonicPromises:
         """
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
+            # Second derivatives, about r^(degree - 2), grow by a factor of e on this length.
             scale = r / (self.degree - 2)
             radii = [_NEAR * scale, fmax(_WIDE * scale, _FLOOR)]
             # Near an axis of high order, a smaller ball has a much smaller bound.

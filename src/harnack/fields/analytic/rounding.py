@@ -147,7 +147,8 @@ def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa
     zeros, ones = 0.0 * cosine, 0.0 * cosine + 1.0
     if l < m:
         return zeros, zeros, 0.0
-    # For each step k: the error that it adds, and its growth G_lk up to step l.
+    # For each step k: the error that it adds, 4u |A z q_(k-1)| + 7u |B r^2 q_(k-2)| with the two
+    # coefficients A and B, and its growth G_lk up to step l, by the same recurrence.
     error, underflow_factor = zeros.copy(), 0.0
     for k in range(m + 1, l + 1):
         z_coefficient, square_coefficient = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
@@ -180,6 +181,8 @@ def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
     """
     abs_q, q_error, _ = _recurrence(l, m)
     cosine, sine = polar_samples(_SAMPLES)
+    # The error of Q; then 3u for the weight and two products, u for each addition, and the error of
+    # (x + iy)^m.
     total = q_error + (3 + addition_count + _complex_power_error(m)) * abs_q
     if is_divided:
         # |q_(l-1)| of the orders m + 1 and m.
@@ -395,7 +398,7 @@ def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, 
 
     Returns three results: the part of the errors of its angles that is constant; for each axis, the
     part that is proportional to the absolute value of that coordinate, as a factor; and the error
-    of the other operations.
+    of the other operations. `WaveRounding` derives the numbers.
     """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2

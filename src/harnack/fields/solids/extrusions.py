@@ -318,8 +318,9 @@ class Extrusion(Solid):
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
-        # As in the proof of the class docstring: the constants are multiplied, and the radius is
-        # min(R, S/c), where c is `constant`.
+        # The taper's inverse, with the constant c on the ball of radius R, is followed by that of
+        # the twist, on a ball of radius S. Points within min(R, S/c) of p stay in both balls, and
+        # the two constants are multiplied.
         if twist is not None:
             inner_constant, inner_radius = twist.preimage_lipschitz(p)
             constant, radius = (

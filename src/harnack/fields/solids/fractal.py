@@ -227,6 +227,7 @@ class FractalNoise(FormulaSolid):
         """The same noise with its numbers and bounds as kernel parameters of the backend (numbers
         that a compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
+        # `_sum(1.0)` adds up what the octaves multiply a first derivative of the noise by.
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         # `_constants`: bounds of first and second derivatives. `_falls`: the ratio of an octave's
         # amplitude to the one before.

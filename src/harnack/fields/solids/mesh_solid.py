@@ -403,8 +403,8 @@ class _MeshData(UnitFrame):
         gradient = dr.select(on_face, normal * normal_sign, -closest.offset * (sign / distance))
         # Corners are rounded, which turns a triangle by an angle of about the rounding over its
         # height. The height is twice the area over the longest edge, whose length is of the order
-        # of 1 at most. Elsewhere the gradient is a vector over its length: so is its error, which is
-        # at most 2.
+        # of 1 at most. Elsewhere the gradient is a vector over its length: so is its error, which
+        # is at most 2.
         normal_error = 8 * epsilon / double_area
         gradient_error = dr.select(on_face, fmin(normal_error, 2), fmin(2 * error / distance, 2))
         # On a triangle without area nothing is known of the gradient.

@@ -112,6 +112,7 @@ class OutlineEdges:
         # For each edge the number of its loop, so that no chain joins two loops.
         loop = np.repeat(np.arange(len(outline)), [len(array) for array in outline])
         if axis:
+            # Coordinates count from the center, so that the axis is the line x = -center[0].
             keep = (start[:, 0] != -center[0]) | (end[:, 0] != -center[0])
             # Another chain begins behind an edge that is left out.
             loop = loop + np.cumsum(~keep)
@@ -165,7 +166,9 @@ class OutlineEdges:
             x, y, velocity, knots, _VECTOR_ROUNDINGS * epsilon * (size + self.size), epsilon
         )
         zero = 0 * x
-        # The state before any edge, in the order that `_OutlineQuery` describes.
+        # The state before any edge: the distance from the nearest edge, its error, the vector from
+        # its nearest point, its normal, and two masks: whether that point is inside the edge, and
+        # whether the query point is inside. (zero > 1 is False on each lane.)
         start = zero + dr.inf, zero, zero, zero, zero, zero, zero > 1, zero > 1
         state = (*start, *(zero + dr.inf for _ in knots))
         if self.chains is None:

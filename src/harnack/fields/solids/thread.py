@@ -165,7 +165,7 @@ class Thread(Solid):
         sign = dr.select(is_outside, real(1), real(-1))
         distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
-        # Where d < -m/2, in the symbols of the class docstring, f is -m/2; `_least` is m/2.
+        # f is at least -m/2, where m is the smallest radius of the profile; `_least` is m/2.
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))

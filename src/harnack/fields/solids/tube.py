@@ -240,6 +240,7 @@ class Tube(Solid):
         # The last vertex of a polyline is not joined to the first of the next.
         is_segment[[vertex - 1 for vertex in self.starts]] = False
         start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
+        # A record: the start, the vector to the end, and 1 / length^2.
         rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
         groups = None
         if len(rows) >= _MIN_SEGMENTS_FOR_GROUPS:
@@ -699,7 +700,8 @@ class _Segment(Field):
         gradient = dr.select(distance > 0, away / distance, vector(0))
         # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
-        # s = D/2 of the proof, from the smallest possible distance; the bound is 1/s.
+        # The distance D is convex with second derivatives of at most 1/D. So on the ball of radius
+        # D/2 they are at most 2/D, one over that radius. D is taken as the smallest possible one.
         taylor_radius = _TAYLOR_RADIUS * fmax(distance - error, 0)
         promises: tuple[Promise, ...] = (
             Lipschitz(backend.Float(1)),
