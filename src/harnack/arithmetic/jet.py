@@ -346,6 +346,7 @@ class Jet(FormulaNumber):
         number = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(number), x.value_on_backend(number)
         value, meets_cut = angle_range(v, u)
+        # (The first result of `ranges` is the range of the function itself.)
         inverse_r = sqrt.ranges(u.square() + v.square())[0]
         # 1/r is at least 0, and x/r and y/r are within [-1, 1].
         inverse_r = Interval(0 * inverse_r.lower, dr.inf).intersect(reciprocal.ranges(inverse_r)[0])

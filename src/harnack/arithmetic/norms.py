@@ -248,6 +248,7 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
     def at(v: Any) -> Interval:
         """An interval that contains sign(v) |v|^q in spite of rounding."""
+        # The range of the power itself, without those of its derivatives.
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
@@ -262,6 +263,7 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
     length: the range of N.
     """
+    # The range of the reciprocal itself, without those of its derivatives.
     inverse = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), inverse.upper)

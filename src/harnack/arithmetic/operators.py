@@ -413,6 +413,7 @@ class OperationCounter(FormulaNumber):
             self._note(log)
             rate = self.rate + exponent.rate
             self.tally.steepest = max(self.tally.steepest, rate)
+            # The size of the power is not known, and taken as 1.
             return self._after(_FUNCTION, exponent, 1.0, rate)
         n = exponent_of(exponent)
         return self.apply(sqrt if n == 0.5 else power(n))

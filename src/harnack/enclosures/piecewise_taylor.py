@@ -75,6 +75,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
             rises = gaps.below == dr.inf
             reach, is_free = self._free_on_pieces(fmin(gaps.above, gaps.below), rises)
         else:
+            # True for the level above, False for the level below.
             up, is_free_above = self._free_on_pieces(gaps.above, True)
             down, is_free_below = self._free_on_pieces(gaps.below, False)
             reach, is_free = fmin(up, down), is_free_above & is_free_below

@@ -122,6 +122,7 @@ class ParabolaBounds(FormulaNumber):
     def sum(self, other: Any) -> ParabolaBounds:
         """The sum of this function and another one: values and bounds are added."""
         value = self.value + other.value
+        # Rounded downwards (-1) and upwards (1).
         lower = _sum(self.lower, other.lower, -1)
         upper = _sum(self.upper, other.upper, 1)
         if self.polynomial_degree is None or other.polynomial_degree is None:
@@ -158,7 +159,7 @@ class ParabolaBounds(FormulaNumber):
         # Both are of degree 1: their product is a parabola.
         if degree == 2:
             lower, upper = self._product_of_lines(other)
-            return self._new(value, lower, upper, 2)
+            return self._new(value, lower, upper, 2)  # a polynomial of degree 2
         if self.bound_degree == 1:
             return self._new(value, *self._straight_product(other))
         return self._new(value, *self._curved_product(other))
@@ -172,6 +173,7 @@ class ParabolaBounds(FormulaNumber):
         value = self.value * factor
         middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
+            # The constant 0, a polynomial of degree 0.
             return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
         lower_bound, upper_bound = self.lower, self.upper
         # The bounds of m f; the lower one is the product with the upper bound if m < 0.
@@ -396,6 +398,7 @@ class ParabolaBounds(FormulaNumber):
         # numbers between them.
         half_curvature = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
         remainder = half_curvature * Interval(min_chord_slope, max_chord_slope).square()
+        # Rounded downwards (-1) and upwards (1).
         return (
             _sum(linear_part.lower, (0.0, remainder.lower), -1),
             _sum(linear_part.upper, (0.0, remainder.upper), 1),
@@ -418,7 +421,8 @@ class ParabolaBounds(FormulaNumber):
         )  # proved to be larger at 0
         below = _common_lower_bound([f_low, g_low], h)
         below = _select(is_f_larger_at_start, f_low, _select(is_g_larger_at_start, g_low, below))
-        # Proved to be larger on the whole length: f's least is above g's largest.
+        # Proved to be larger on the whole length: f's least is above g's largest. (-1: differences
+        # are rounded downwards.)
         f_min_change, f_max_change = (
             -_maximum_on_piece(_negate(f_low), h),
             _maximum_on_piece(f_high, h),
@@ -682,6 +686,7 @@ def _lines_bounding_parabolas(
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
         return lower, upper
+    # Rounded downwards (-1) and upwards (1).
     low = _minimum_or_inf(a, _shift_by_rounding(a + b * h, -1, dr.abs(a) + dr.abs(b) * h))
     high = _maximum_or_inf(c, _shift_by_rounding(c + d * h, 1, dr.abs(c) + dr.abs(d) * h))
     return (low, 0.0), (high, 0.0)

@@ -253,6 +253,7 @@ def _check_gradient(
     stencil: the samples at the nodes of the differences.
     """
     tolerance, allowance = _limits(field, points, samples, stencil)
+    # The difference with the smaller of the two spacings.
     error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
     _require_agreement(error, tolerance, allowance, message, points, has_creases=field.has_creases)

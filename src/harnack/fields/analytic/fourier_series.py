@@ -264,6 +264,7 @@ class FourierSeries(Field):
         """The largest |series - fitted function|, at random points of the box if a callable was
         fitted, at all points of the grid if a grid was."""
         if callable(self._source):
+            # With the seed 0, so that the result is always the same.
             points = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
             values = _values(self._source, points)
         else:

@@ -107,6 +107,7 @@ class _OrderTerm:
 
         C and its derivatives are largest at w = 1.
         """
+        # C, C' and C'' at w = 1; below, bounds of S, of its gradient and of its Hessian.
         c, first, second = (float(number) for number in self.axial(1.0))
         value, slope, curvature = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
         return slope * c + value * first, curvature * c + slope * first + value * second

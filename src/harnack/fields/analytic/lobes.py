@@ -133,6 +133,7 @@ class Lobes(Field):
         self._size: Any = self.scale
         (first_harmonic, *other_harmonics) = self.weights
         if other_harmonics:
+            # The range of the sum of solid harmonics on the unit ball, which contains the sphere.
             value_range = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
         else:
             # A single harmonic has a sharper range. A negative weight exchanges its ends.

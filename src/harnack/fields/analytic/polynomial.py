@@ -113,6 +113,7 @@ class HarmonicPromises:
         known: proved ranges of the parts of f of each degree.
         is_divided: whether points are divided by a size other than 1 first, which adds rounding.
         """
+        # The radii of the balls about the origin, and about a point of the unit sphere.
         center_radius, boundary_radius = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial_bounds, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
@@ -124,6 +125,7 @@ class HarmonicPromises:
                 gradient_bound(nonconstant),
                 hessian_bound(nonconstant),
             )
+            # The largest |f - constant| on the unit ball.
             lower, upper = known.by_degree(1.0)
             max_value = max(upper - known.constant, known.constant - lower)
             # If rho = axis_share r, both bounds of a single term are the same.
@@ -300,6 +302,7 @@ class _SolidHarmonics(Field):
         self._weights = weights
         self._size = size
         self._promises = HarmonicPromises.of(weights, known, is_divided=size != 1.0)
+        # On the ball |p| <= size, in units of the size.
         self.value_range = known.with_spheres(weights, 1.0).on_ball(1.0)
 
     @property

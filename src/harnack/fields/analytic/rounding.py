@@ -143,6 +143,7 @@ def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa
     of step k has grown at step l) times the sum of the step's coefficients plus 2.
     """
     cosine, _ = polar_samples(_SAMPLES)
+    # On the unit sphere z is the cosine, and r^2 is 1.
     q = Legendre(cosine, 1.0)
     zeros, ones = 0.0 * cosine, 0.0 * cosine + 1.0
     if l < m:

@@ -218,6 +218,7 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power
         m * (m - 1) * power(m - 2) * math.cos((m - 2) * azimuth),
         -m * (m - 1) * power(m - 2) * math.sin((m - 2) * azimuth),
     )
+    # A single term with the weight 1; on the unit sphere r^2 is 1.
     sums = _hessian_sums([(l, 1.0)], m, Legendre(z, 1.0))
     # The added 0 makes arrays of constants.
     xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _hessian_of_sums(sums, basis, x, y))
@@ -341,6 +342,7 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     sample_count = 64
     angles = 2 * np.pi * np.arange(sample_count) / sample_count
     x, y = np.cos(angles), np.sin(angles)
+    # On the circle z is 0 and r^2 is 1.
     legendre = Legendre(0.0, 1.0)
     weights: dict[tuple[int, int], float] = {}
     for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741

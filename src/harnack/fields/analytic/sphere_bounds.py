@@ -229,6 +229,7 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     if l == 0:
         return 0.0
     z, rho = polar_samples()
+    # On the unit sphere r^2 is 1.
     q = Legendre(z, 1.0)
     at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
     if m == 0:

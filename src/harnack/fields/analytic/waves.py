@@ -211,7 +211,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
         if isinstance(term, PlaneWave):
             k = term.wave_vector
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
-            wave = term.amplitude * sincos(angle)[1]
+            wave = term.amplitude * sincos(angle)[1]  # times the cosine
             for i, j in upper:
                 if k[i] * k[j] != 0:
                     upper[i, j] -= k[i] * k[j] * wave

@@ -175,6 +175,7 @@ class HRBF(Formula):
         # computed in the one loop over the points.
         recorder = KnotRecorder()
         length = ahead
+        # (The slope is not needed for this.)
         path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
         # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:

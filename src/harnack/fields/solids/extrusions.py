@@ -288,6 +288,7 @@ class Extrusion(Solid):
         point that twist and taper move to a point of the ray), since f has the Lipschitz constant 1
         as a function of the preimage. On lanes where no bound is found, the constant is infinite,
         and holds on the length 0."""
+        # The jets of the preimage's coordinates, as functions of the length from 0 to `length`.
         local = self._preimage(*Jet.along_ray(p, direction, 0.0, length))
         speeds = [0 * p.x + jet.first_derivatives[0].max_abs for jet in local]
         speed = dr.norm(cast("Any", type(p))(*speeds)) * (1 + 1e-5)

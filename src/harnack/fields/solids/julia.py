@@ -161,7 +161,7 @@ class Julia(Solid):
         # Where |f|/|grad f| tells nothing, any length may be tried.
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
         radii = tuple(longest * fraction for fraction in _RADIUS_FRACTIONS)
-        constants = self._orbit(p, radii)[3]
+        constants = self._orbit(p, radii)[3]  # the bounds of |grad f|
         promises: list[Lipschitz] = []
         for radius, constant in zip(radii, constants, strict=True):
             is_proved = (constant >= 0) & (constant < dr.inf)

@@ -232,6 +232,7 @@ class OutlineEdges:
             def has_more(j: Any, *_: Any) -> Mask:
                 return j < count
 
+            # The state of the inner loop, without its index.
             return i + 1, *dr.while_loop((type(i)(0), *state), has_more, each, label="outline")[1:]
 
         def has_more_chains(i: Any, *_: Any) -> Mask:

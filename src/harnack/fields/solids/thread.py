@@ -395,6 +395,7 @@ def metric_thread(
     # The lengths along the axis of the flat crest, of a flank, and of the flat root.
     flat, flank, bottom = pitch / 8 + 2 * shift, 5 * pitch / 16, pitch / 4 - 2 * shift
     z = np.cumsum([-shift, flat, flank, bottom])
+    # With a single start.
     thread = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
     outer = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
     bevel = outer - root

@@ -406,6 +406,7 @@ class _InverseMap:
     def of(cls, change: AffineMap) -> _InverseMap:
         """The inverse of the affine map `change`, in Python numbers."""
         inverse = change.inverse
+        # The first singular value is the largest.
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
             tuple(tuple(float(number) for number in row) for row in inverse),
