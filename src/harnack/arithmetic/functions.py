@@ -101,6 +101,7 @@ def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> Deriva
     ranges: of the function, of its derivative and of its second derivative.
     """
     value, *derivatives = ranges
+    # (The last argument of `typed_select` tells the type of the numbers only.)
     slope, second = (
         Interval(
             typed_select(defined, derivative.lower, -dr.inf, value.lower),
@@ -133,7 +134,8 @@ def _exponential_range(f: Callable[[Any], Any], x: Interval) -> Interval:
         result = f(v)
         error = machine_epsilon(v) * (_MAX_ULP_ERROR + dr.abs(v))
         moved = dr.fma(dr.abs(result), sign * error, result) + sign * _smallest_normal(x)
-        # A lower bound must not be +infinity, nor an upper bound -infinity.
+        # A lower bound must not be +infinity, nor an upper bound -infinity. (The last argument of
+        # `typed_select` tells the type of the numbers only.)
         return typed_select(sign * result == -dr.inf, -sign * large, moved, v)
 
     return Interval(end(x.lower, -1), end(x.upper, 1))
@@ -328,7 +330,7 @@ def _asin(x: Interval) -> DerivativeRanges:
     If x is not within [-1, 1], the range of the arc sine is that on the part of x in [-1, 1], and
     the ranges of the derivatives are all numbers."""
     inside = Interval(fmax(x.lower, -1), fmin(x.upper, 1))
-    # 1/sqrt(1 - x^2) and x/sqrt(1 - x^2)^3
+    # 1/sqrt(1 - x^2) and x/sqrt(1 - x^2)^3. (The first result of `_sqrt` is the range of the root.)
     slope = _positive_reciprocal(_sqrt(ONE - inside.square())[0])
     second = inside * slope * slope.square()
     return _unbounded_unless_defined(
@@ -476,7 +478,8 @@ def power(n: float) -> ElementaryFunction:
     def of_positive(x: Any) -> Any:
         return dr.power(fmax(x, 0), n)
 
-    # With an exponent below 1 the slope is unbounded at 0; with one below 0 there is a pole.
+    # The domain, and whether the slope is unbounded somewhere. With an exponent below 1 it is at 0;
+    # with one below 0 there is a pole.
     return ElementaryFunction(
         f"power {n}", real, of_positive, _numpy_power(n), _POSITIVE, n < 1, has_pole=n < 0
     )

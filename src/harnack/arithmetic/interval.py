@@ -160,6 +160,7 @@ class Interval:
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
+        # `_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
         return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
@@ -170,6 +171,7 @@ class Interval:
             return self
         if a == b == -1.0:
             return -self
+        # (`_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.)
         # The constant may have either sign: the range is symmetric.
         if a < 0.0 < b:
             bound = _pad_underflow(self.max_abs * max(-a, b), 1)
@@ -190,6 +192,7 @@ class Interval:
         low, high = self.min_abs, self.max_abs
         if self.lower is self.upper:
             low = high
+        # `_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
         result = self._rounded_outward(
             _pad_underflow(low * low, -1), _pad_underflow(high * high, 1)
         )
@@ -202,7 +205,8 @@ class Interval:
                 return Interval(-math.inf, math.inf, self.is_single)
             return self._rounded_outward(1 / self.upper, 1 / self.lower)
         has_zero = ~((self.lower > 0) | (self.upper < 0))
-        # The error of quotients is two units on CUDA.
+        # The error of quotients is two units on CUDA. (`_pad_underflow` moves a number down (-1) or
+        # up (1) by what underflow may have cut off.)
         low = _round_down(_pad_underflow(1 / self.upper, -1), 4.0)
         high = _round_up(_pad_underflow(1 / self.lower, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))

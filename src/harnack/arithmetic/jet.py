@@ -205,11 +205,12 @@ class Jet(FormulaNumber):
         """
         if not (self.roots and factor.is_literal and factor.lower > 0):
             return ()
-        low, high = (math.sqrt(cast("float", number)) for number in (factor.lower, factor.upper))
+        low, high = (math.sqrt(cast("float", entry)) for entry in (factor.lower, factor.upper))
         kind = cast("Any", type(self.backend_number()))
+        # The range of the constant's root, rounded outwards.
         low, high = math.nextafter(low, 0.0), math.nextafter(high, math.inf)
         scale = Interval.enclosing(low, kind).hull(Interval.enclosing(high, kind))
-        return tuple(number * number._constant(scale) for number in self.roots)
+        return tuple(entry * entry._constant(scale) for entry in self.roots)
 
     def __truediv__(self, other: Any) -> Any:
         """The quotient of this function and another one: this function times the reciprocal.
@@ -248,7 +249,7 @@ class Jet(FormulaNumber):
         Its derivatives are f(g)' = f' g' and f(g)'' = f'' g' g' + f' g'', with f' and f'' on the
         range of g. The square root of a known sum of squares is computed as a norm.
         """
-        # The square root of a sum of squares.
+        # The square root of a sum of squares. (`norms` itself imports this module.)
         if function is sqrt and self.roots:
             from harnack.arithmetic.norms import norm
 
@@ -345,6 +346,7 @@ class Jet(FormulaNumber):
         number = x.backend_number() if self.value.is_literal else self.backend_number()
         v, u = self.value_on_backend(number), x.value_on_backend(number)
         value, meets_cut = angle_range(v, u)
+        # (The first result of `ranges` is the range of the function itself.)
         inverse_r = sqrt.ranges(u.square() + v.square())[0]
         # 1/r is at least 0, and x/r and y/r are within [-1, 1].
         inverse_r = Interval(0 * inverse_r.lower, dr.inf).intersect(reciprocal.ranges(inverse_r)[0])
@@ -419,6 +421,7 @@ class Jet(FormulaNumber):
             return self.value
         kind = cast("Any", type(self.backend_number() if like is None else like))
         low = kind(self.value.lower)
+        # A point interval has the same object as both ends.
         return Interval(
             low, low if self.value.lower == self.value.upper else kind(self.value.upper)
         )
@@ -442,7 +445,8 @@ class Jet(FormulaNumber):
         """
         if start is None:
             return self
-        # The range of the change since the start of the piece.
+        # The range of the change since the start of the piece. A piece has one variable, the
+        # length, so that derivatives have the index 0.
         rise = range_times_length(self.first_derivatives[0], width)
         first = self.first_derivatives[0]
         if self.second_derivatives:
@@ -557,6 +561,7 @@ class Dual(FormulaNumber):
         If this function is constant, so is the result, even where the slope of the elementary
         function is infinite, such as that of the root in a norm of zeros.
         """
+        # The derivative of the elementary function, as the middle of its range at a point.
         slope = function.ranges(Interval.point(self.value))[1].midpoint
         real = cast("Any", type(self.value))
 

@@ -147,6 +147,7 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     In the code `inverse_norm` is the range of 1/N, `ratios` are the ranges of x_i/N, and `pulls`
     are those of sign(x_i) |x_i/N|^(p-1), the derivatives of N by the x_i.
     """
+    # Any number of the backend, for the type of the others.
     number = next((f.value.lower for f in xs if not f.value.is_literal), None)
     number = xs[0].backend_number() if number is None else number
     values = [as_backend_interval(f.value, number) for f in xs]
@@ -171,6 +172,7 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
         else:
             convex = -(first[i] * first[j])
             for f, u in zip(xs, ratios, strict=True):
+                # The first of the three ranges is that of the power itself.
                 weight = power(p - 2).ranges(Interval(u.min_abs, u.max_abs))[0]
                 convex = convex + weight * _product(f.first_derivatives[i], f.first_derivatives[j])
             convex = convex * inverse_norm * Interval.enclosing(p - 1, type(number))
@@ -225,6 +227,7 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
     sizes: the numbers.
     """
+    # (The first result of `ranges` is the range of the function itself.)
     if p == 2.0:
         return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
@@ -245,6 +248,7 @@ def _signed_power(x: Interval, q: float) -> Interval:
 
     def at(v: Any) -> Interval:
         """An interval that contains sign(v) |v|^q in spite of rounding."""
+        # The range of the power itself, without those of its derivatives.
         size = power(q).ranges(Interval.point(dr.abs(v)))[0]
         return Interval(
             dr.select(v >= 0, size.lower, -size.upper), dr.select(v >= 0, size.upper, -size.lower)
@@ -259,6 +263,7 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
     length: the range of N.
     """
+    # The range of the reciprocal itself, without those of its derivatives.
     inverse = reciprocal.ranges(length)[0]
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), inverse.upper)

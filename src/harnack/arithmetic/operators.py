@@ -398,6 +398,7 @@ class OperationCounter(FormulaNumber):
         """The product of this number and another one. The result counts as a sum of squares if both
         factors are the same number, or if one is a sum of squares and the other a positive
         constant."""
+        # (`is_square` of a constant says that it is not negative.)
         is_scaled = self.is_constant or other.is_constant
         is_square = other is self or (is_scaled and self.is_square and other.is_square)
         size, rate = self.size * other.size, self.size * other.rate + other.size * self.rate
@@ -412,6 +413,7 @@ class OperationCounter(FormulaNumber):
             self._note(log)
             rate = self.rate + exponent.rate
             self.tally.steepest = max(self.tally.steepest, rate)
+            # The size of the power is not known, and taken as 1.
             return self._after(_FUNCTION, exponent, 1.0, rate)
         n = exponent_of(exponent)
         return self.apply(sqrt if n == 0.5 else power(n))

@@ -36,7 +36,9 @@ _LARGE_EXPONENT = 0.5
 @dataclass(frozen=True, eq=False)
 class Values(FormulaNumber):
     """The range of a function on a box of its variables, and whether it is continuous and has a
-    value everywhere in the box. All are known lane by lane.
+    value everywhere in the box. All are known lane by lane. Three masks tell whether it has a value
+    at no point of the box (`nowhere`), whether it may jump (`jumps`), and whether there may be
+    points without a value (`gaps`).
 
     value: the range of its values, over the points of the box at which it has one.
     nowhere: whether it has a value at no point of the box.
@@ -113,6 +115,7 @@ class Values(FormulaNumber):
         function is outside of the elementary function's domain. It may jump if its range is lost,
         or if it may have a pole."""
         x = self.value
+        # The first result of `ranges` is the range of the function itself.
         value, (domain_low, domain_high) = function.ranges(x)[0], function.domain
         nowhere, gaps = self.nowhere, self.gaps
         if domain_low > -math.inf:
@@ -137,6 +140,7 @@ class Values(FormulaNumber):
         """
         x, y = self.value, other.value
         gaps = self.gaps | other.gaps
+        # x, or y where this function has no value at all; and the other way round.
         either = _unless(self.nowhere, x, y).hull(_unless(other.nowhere, y, x))
         # Without such points it is the larger of both lower ends.
         low = dr.select(gaps, either.lower, x.intersect(y).lower)

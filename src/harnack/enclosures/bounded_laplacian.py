@@ -175,6 +175,7 @@ class BoundedLaplacianEnclosure(Enclosure):
         fall, rise, slopes = self.max_fall, self.max_rise, self.slopes
         return (
             self._growth(gaps.above, fall, rise, self.laplacian_mean, slopes.upper),
+            # Of -f: fall and rise are exchanged, and the signs of the others change.
             self._growth(gaps.below, rise, fall, -self.laplacian_mean, slopes.negated().upper),
         )
 
@@ -182,8 +183,8 @@ class BoundedLaplacianEnclosure(Enclosure):
         """Return the condition for f not to rise to the level above. For the numbers of -f as
         arguments, it is the condition for f not to fall to the level below.
 
-        All numbers of the condition are divided by w + l R^2. R, l and w are the symbols of the
-        proof of the class.
+        All numbers of the condition are divided by w + l R^2. Here R is the radius, l half the
+        difference of the two bounds of the Laplacian, and w = max(u + m R^2/6, 0).
 
         gap: the difference between f(p) and the level.
         u: f(p) - c, how far f may fall on the ball.
@@ -242,7 +243,8 @@ class _GreenCondition:
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q), in a form that does not cancel near q = 0. Here c is (S - 1)/q + 2, and root
+        """Return k(q) = g + 1 + (sqrt(S) - 1)/q, in a form that does not cancel near q = 0. S is
+        (1-q)^2 times (1 + the left side of the condition). In the code c is (S - 1)/q + 2, and root
         is sqrt(S)."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))

@@ -241,6 +241,7 @@ class Levels:
                 below_gap = dr.select(offset < 0, math.inf, offset)
                 above_gap = dr.select(offset > 0, math.inf, -offset)
             below, above = fmin(below, below_gap), fmin(above, above_gap)
+        # With a single level, only one of the two gaps is finite.
         return LevelGaps(below, above, len(self.values) == 1 and self.period is None)
 
     def offset_to_nearest(self, f: Real) -> Real:

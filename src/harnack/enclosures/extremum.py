@@ -231,8 +231,9 @@ class NearestBranchEnclosure(Enclosure):
     reach: Real
 
     def free_length(self, gaps: LevelGaps) -> Real:
-        """Return the shortest of the lengths that the two parts of the class's proof give, over all
-        branches.
+        """Return the shortest of several lengths: those up to which each branch is proved to stay
+        above the level towards zero, and the one up to which the nearest branch stays below the
+        level away from zero. The class has the proof.
 
         gaps: the differences between f at the start and the next levels below and above.
         """
@@ -252,6 +253,7 @@ class NearestBranchEnclosure(Enclosure):
         # Comparisons with NaN are False, so that it proves nothing.
         is_valid = (length >= 0) & (self.distance >= 0)
         for branch in self.branches:
+            # How far |phi_j| may fall: `excess` is by how much it is larger than |f|.
             gap = fmax(gap_towards_zero + branch.excess, 0)
             branch_length = first_reach(gap, -branch.slopes.lower, self.second_derivative_bound)
             is_valid &= branch_length >= 0
@@ -313,6 +315,8 @@ class BranchPointEnclosure(Enclosure):
 
         The path leaves the disk of radius r at the length closest_parameter + sqrt(r^2 -
         closest_distance^2) of its projection; so the free length is at most that, divided by speed.
+        In the code w, r, C, alpha, L and v are those of the proof: y = |h - c| at the start falls
+        at most at the rate v, and w = y - (|f| - gap).
         """
         gap_towards_zero = dr.select(self.is_positive, gaps.below, gaps.above)
         gap_away = dr.select(self.is_positive, gaps.above, gaps.below)

@@ -126,6 +126,7 @@ def largest_free_fraction(condition: FreeRadiusCondition, rounds: int) -> Real:
         step = q - previous_q
         slope = dr.select(step == 0, 0, (k - previous_k) / step)
         previous_q, previous_k = q, k
+        # The line through the last two points, as (its value at 0) + slope q.
         q = clamp(_root(gap, dr.fma(-slope, q, k), slope), safe, unsafe)
     return safe * CONDITION_SAFETY
 

@@ -64,17 +64,22 @@ class HarnackEnclosure(HarmonicBallEnclosure):
         """Return the free length divided by the radius. If f is bounded on both sides, each bound
         proves a fraction, and the larger one is returned. gaps: the differences between f(p) and
         the next levels."""
-        lower = upper = None
+        # The fractions that the lower and the upper bound of f prove.
+        by_lower = by_upper = None
         # For u = f - lower, "away from 0" is above.
         if self.max_fall is not None:
-            lower = _fraction_from_one_side(self.max_fall, gaps.above, gaps.below, self.dimension)
+            by_lower = _fraction_from_one_side(
+                self.max_fall, gaps.above, gaps.below, self.dimension
+            )
         if self.max_rise is not None:  # the same for upper - f, positive and harmonic
-            upper = _fraction_from_one_side(self.max_rise, gaps.below, gaps.above, self.dimension)
-        if lower is None or upper is None:
-            fraction = lower if upper is None else upper
+            by_upper = _fraction_from_one_side(
+                self.max_rise, gaps.below, gaps.above, self.dimension
+            )
+        if by_lower is None or by_upper is None:
+            fraction = by_lower if by_upper is None else by_upper
             assert fraction is not None
             return fraction
-        return fmax(lower, upper)
+        return fmax(by_lower, by_upper)
 
 
 def _fraction_from_one_side(u: Real, gap_away: Real, gap_toward: Real, dimension: int) -> Real:
@@ -127,7 +132,7 @@ def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
     which decreases and is convex. This form cancels for large w. For these, y = 1-q is the root of
     the convex function w y^3 + y - 2, and is approached from the right.
     """
-    q = gap / (u + 3 * v)
+    q = gap / (u + 3 * v)  # Newton's first step, from q = 0
     for _ in range(4):
         h = gap - q * (u + v * (3 - 3 * q + q * q))
         q = q + fmax(h, 0) / (u + 3 * v * (1 - q) * (1 - q))
@@ -135,6 +140,7 @@ def _fraction_4d_up(u: Real, v: Real, gap: Real) -> Real:
     y = fmin(dr.cbrt(2 / w), 1)
     for _ in range(4):
         y = y - (y * dr.fma(w * y, y, 1) - 2) / dr.fma(3 * w * y, y, 1)
+    # 1 - y, rounded down.
     return dr.select(v < 2 * u, q, dr.fma(y, -1 - 1e-6, 1))
 
 
@@ -149,7 +155,7 @@ def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
     decreases and is concave. So Newton's method ends on the right of the root. The chord from (0,
     gap) to this point meets 0 on the left of the root, which is the safe side.
     """
-    q = fmin(gap / (u + 3 * v), 1)
+    q = fmin(gap / (u + 3 * v), 1)  # Newton's first step, from q = 0
     for _ in range(4):
         h = gap - q * (u + v * (3 + 3 * q + q * q))
         q = q + fmin(h, 0) / (u + 3 * v * (1 + q) * (1 + q))
@@ -252,7 +258,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             # u = 0 forces u to vanish identically: no level is ever reached.
             inv_u = dr.select(u > 0, 1 / u, dr.inf)
             scale = self.radius * inv_u / self.dimension
-            # The mean m of s, at the largest and at the smallest slope.
+            # m = R f_v/(n u), the mean of the cosine s over the mass on the sphere whose Poisson
+            # integral is u, at the largest and at the smallest slope f_v.
             mean_upper = dr.select(u > 0, slopes.upper * scale, 0)
             mean_lower = dr.select(u > 0, slopes.lower * scale, 0)
             slack = condition_rounding(type(gaps.above))
@@ -294,7 +301,7 @@ class _ChordCondition:
         gap: the gap divided by u at the center, which is w - 1.
         mean, dimension: m and n.
         """
-        # g = w^(1/K) - 1, in forms that do not cancel for small gaps.
+        # g = w^(1/K) - 1 with K = n - 1, in forms that do not cancel for small gaps.
         if dimension == 3:
             gap = gap / (dr.sqrt(1 + gap) + 1)
         elif dimension == 4:
@@ -310,8 +317,10 @@ class _ChordCondition:
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q), in a form that does not cancel near q = 0. Here (B - 1)/q is c - K, and root
-        is B^(1/K); so (root - 1)/q follows from c without a difference of large numbers."""
+        """Return k(q) = g + 1 + (B^(1/K) - 1)/q, in a form that does not cancel near q = 0. B is
+        the chord of Poisson's kernel, at the mean m, times (1-q)^K; K is n - 1. In the code
+        (B - 1)/q is c - K, and root is B^(1/K); so (root - 1)/q follows from c without a difference
+        of large numbers."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -353,7 +362,8 @@ class _JensenCondition:
         return -weight * n * m, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q), in a form that does not cancel near q = 0. Here d is D, e is (D - 1)/q, and
+        """Return k(q) = (1-g) (D^(n/2) - 1 + q^2)/q + g q with D = 1 + q^2 - 2 q m, in a form that
+        does not cancel near q = 0. In the code d is D, e is (D - 1)/q, x is the root of D, and
         `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
@@ -445,6 +455,7 @@ class SphericalCapEnclosure(HarmonicBallEnclosure):
         assert fall is not None
         assert rise is not None
         inverse = 1 / (fall + rise)
+        # p is where f at the center lies in its range, from 0 at c to 1 at C.
         p, rest = fall * inverse, rise * inverse
         # Times the slope, this is mu; the second condition is that for C - f, whose slope is
         # negated.
@@ -465,8 +476,9 @@ def _two_caps(gap: Real, max_rise: Real, p: Real, rest: Real, mu: Real) -> _CapC
 
     gap: the difference between f and that level.
     max_rise: C - f at the center.
-    p, rest: p and 1 - p.
-    mu: the largest first moment that the range of slopes allows.
+    p, rest: p = (f - c)/(C - c), with f at the center, and 1 - p.
+    mu: the largest first moment that the range of slopes allows: R f_v/(3 (C - c)) for the largest
+        slope f_v.
 
     If c = C, f is constant and no level is ever reached. A level beyond C is not reached, either.
     """

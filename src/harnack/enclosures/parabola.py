@@ -93,6 +93,7 @@ class LipschitzEnclosure(ParabolaEnclosure):
         if not isinstance(promise, Lipschitz):
             return None
         constant = _nan_if_negative(promise.constant)
+        # Second derivatives of 0: both parabolas are lines.
         return cls(SlopeRange(-constant, constant), 0.0, 0.0, promise.radius)
 
     # Both sides in one formula, for speed: a ray along an edge uses a dozen cones at each point.
@@ -274,9 +275,11 @@ class SphereArcEnclosure(Enclosure):
 
         gaps: the differences between f at the start and these levels.
 
-        In the symbols of the proof of the class, `square_sum` is S = c^2 + t^2,
-        `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the smallest
-        angle psi at which f may reach a level. The result is the length s that belongs to psi.
+        Let t (`offset`) be the position of the start on the line, measured from the line's point q
+        closest to the origin, and c^2 = 1 + |q|^2 (`squared_radius`). `square_sum` is S = c^2 +
+        t^2, `length_per_angle` is dt/da = S/(2c) at the start, and `half_angle` is half the
+        smallest angle psi at which f may reach a level. The result is the length s that belongs to
+        psi.
         """
         c = dr.sqrt(self.squared_radius)
         square_sum = dr.fma(self.offset, self.offset, self.squared_radius)

@@ -75,6 +75,7 @@ class PiecewiseTaylorEnclosure(Enclosure):
             rises = gaps.below == dr.inf
             reach, is_free = self._free_on_pieces(fmin(gaps.above, gaps.below), rises)
         else:
+            # True for the level above, False for the level below.
             up, is_free_above = self._free_on_pieces(gaps.above, True)
             down, is_free_below = self._free_on_pieces(gaps.below, False)
             reach, is_free = fmin(up, down), is_free_above & is_free_below
@@ -158,4 +159,5 @@ class PiecewiseTaylorEnclosure(Enclosure):
         by_parabola = (curved + linear) + epsilon * (dr.abs(curved) + dr.abs(linear))
         rise = fmin(by_parabola, max_slope * length + epsilon * dr.abs(max_slope * length))
         slope = dr.fma(curvature, length, slope)
+        # The slope at the end is rounded up.
         return dr.fma(0.25 * epsilon, dr.abs(slope), slope), reach, gap - rise

@@ -138,6 +138,7 @@ class Promise(abc.ABC):
 
     def negated(self) -> Self:
         """Return the promise of -f: a range from a to b becomes the range from -b to -a."""
+        # A pair: the names of the attributes that are the lower and the upper end of a range.
         numbers = {
             name: -getattr(self, opposite)
             for lower, upper in self.interval_pairs
@@ -181,6 +182,7 @@ class Promise(abc.ABC):
         change: a function of (number, i, j) that returns the new number; i and j are the exponents
             of the number's unit, (unit of f)^i (length)^j.
         """
+        # An entry of `units`: the name of an attribute, and the two exponents.
         numbers = {name: change(getattr(self, name), *powers) for name, *powers in self.units}
         return dataclasses.replace(self, **numbers)
 
@@ -188,6 +190,7 @@ class Promise(abc.ABC):
         """Return the promise `other`, which is of the same kind, on the lanes of the mask, and this
         promise on all other lanes."""
         numbers: dict[str, Any] = {}
+        # `units` has an entry for each number; it begins with the name of its attribute.
         for name, *_ in self.units:
             new, old = getattr(other, name), getattr(self, name)
             # Equal Python numbers stay Python numbers: code asks whether they are infinite while a

@@ -174,6 +174,8 @@ class EnclosureKinds:
                 "needs at "
                 "least one limit that is not infinite, lower or upper, a BoundedLaplacian both"
             )
+        # Without the field's weaker promises, these are the classes that are used if the option is
+        # left out: then the hint would be of no use.
         hint = (
             ""
             if not self.uses_alternative_promises

@@ -62,7 +62,8 @@ class BottomUpQuadraticEnclosure(ParabolaEnclosure):
             function,
             ParabolaBounds.along_ray(function.p, function.direction, length, degree=cls.degree),
         )
-        # The change of f lies between a s + b s^2 and c s + d s^2.
+        # The change of f lies between a s + b s^2 and c s + d s^2. (2b and 2d are the second
+        # derivatives of these.)
         (a, b), (c, d) = parabolas.bounds
         return cls(SlopeRange(a, c), 2 * b, 2 * d, length)
 

@@ -77,6 +77,7 @@ class ParabolaBounds(FormulaNumber):
         def coordinate(x: Real, slope: Real) -> ParabolaBounds:
             """The function x + s slope. It is a line, and both bounds are this line."""
             line = slope, 0.0
+            # As a polynomial it has the degree 1.
             return cls(Interval.point(x), line, line, length, degree, 1)
 
         x, y, z = (coordinate(p[k], direction[k]) for k in range(3))
@@ -121,6 +122,7 @@ class ParabolaBounds(FormulaNumber):
     def sum(self, other: Any) -> ParabolaBounds:
         """The sum of this function and another one: values and bounds are added."""
         value = self.value + other.value
+        # Rounded downwards (-1) and upwards (1).
         lower = _sum(self.lower, other.lower, -1)
         upper = _sum(self.upper, other.upper, 1)
         if self.polynomial_degree is None or other.polynomial_degree is None:
@@ -157,7 +159,7 @@ class ParabolaBounds(FormulaNumber):
         # Both are of degree 1: their product is a parabola.
         if degree == 2:
             lower, upper = self._product_of_lines(other)
-            return self._new(value, lower, upper, 2)
+            return self._new(value, lower, upper, 2)  # a polynomial of degree 2
         if self.bound_degree == 1:
             return self._new(value, *self._straight_product(other))
         return self._new(value, *self._curved_product(other))
@@ -171,6 +173,7 @@ class ParabolaBounds(FormulaNumber):
         value = self.value * factor
         middle, radius = factor.midpoint, factor.radius
         if factor.is_zero:
+            # The constant 0, a polynomial of degree 0.
             return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
         lower_bound, upper_bound = self.lower, self.upper
         # The bounds of m f; the lower one is the product with the upper bound if m < 0.
@@ -178,6 +181,7 @@ class ParabolaBounds(FormulaNumber):
             (middle * bound[0], middle * bound[1]) for bound in (lower_bound, upper_bound)
         ]
         is_negative = middle < 0
+        # For each coefficient, u is that of the lower bound and v that of the upper one.
         lower = tuple(dr.select(is_negative, v, u) for u, v in zip(*scaled_bounds, strict=True))
         upper = tuple(dr.select(is_negative, u, v) for u, v in zip(*scaled_bounds, strict=True))
         sizes = [fmax(dr.abs(u), dr.abs(v)) for u, v in zip(lower_bound, upper_bound, strict=True)]
@@ -266,10 +270,14 @@ class ParabolaBounds(FormulaNumber):
                 (4 * bh * dh,),
             )
             c0, c1, c2, c3 = (sum(term[1:], term[0]) for term in terms)
+            # The lines found below have values at 0 and 1 that are sums of a value and of a slope
+            # of the derivative. A term of r^k enters the value at most once, the slope k times.
             rounding_size = sum(
                 ((k + 1) * dr.abs(term) for k, group in enumerate(terms) for term in group), 0 * h
             )
-            # The uncertainty of the values, and the difference of the bounds of a polynomial.
+            # The part of the product's change that is due to the radii (those of f(0) and g(0), and
+            # those of the coefficients) is at most `uncertainty` r in magnitude. A constant that is
+            # added to the derivative adds just that to the change.
             size_f = dr.abs(ah) + 2 * dr.abs(bh)
             size_g = dr.abs(ch) + 2 * dr.abs(dh)
             uncertainty = rv * size_g + rw * size_f
@@ -386,8 +394,11 @@ class ParabolaBounds(FormulaNumber):
         (min_chord_slope, _), (max_chord_slope, _) = _lines_bounding_parabolas(
             self.lower, self.upper, self.piece_length
         )
+        # x = f(s) - f(0) lies between s times these two slopes, so x^2 is s^2 times a square of
+        # numbers between them.
         half_curvature = Interval(0.5 * curvature.lower, 0.5 * curvature.upper)
         remainder = half_curvature * Interval(min_chord_slope, max_chord_slope).square()
+        # Rounded downwards (-1) and upwards (1).
         return (
             _sum(linear_part.lower, (0.0, remainder.lower), -1),
             _sum(linear_part.upper, (0.0, remainder.upper), 1),
@@ -410,7 +421,8 @@ class ParabolaBounds(FormulaNumber):
         )  # proved to be larger at 0
         below = _common_lower_bound([f_low, g_low], h)
         below = _select(is_f_larger_at_start, f_low, _select(is_g_larger_at_start, g_low, below))
-        # Proved to be larger on the whole length: f's least is above g's largest.
+        # Proved to be larger on the whole length: f's least is above g's largest. (-1: differences
+        # are rounded downwards.)
         f_min_change, f_max_change = (
             -_maximum_on_piece(_negate(f_low), h),
             _maximum_on_piece(f_high, h),
@@ -454,15 +466,15 @@ class ParabolaBounds(FormulaNumber):
     def range(self) -> Interval:
         """The range of the function on the whole path: its value at s = 0 plus the extremes of the
         two parabolas."""
-        # `min_change` is minus the smallest change.
+        # How far the function may fall below its value at the start, and rise above it.
         h, value = self.piece_length, _on_backend(self.value, self.piece_length)
-        min_change, max_change = (
+        max_fall, max_rise = (
             _maximum_on_piece(_negate(self.lower), h),
             _maximum_on_piece(self.upper, h),
         )
         return Interval(
-            (value + Interval(-min_change, -min_change)).lower,
-            (value + Interval(max_change, max_change)).upper,
+            (value + Interval(-max_fall, -max_fall)).lower,
+            (value + Interval(max_rise, max_rise)).upper,
         )
 
     def _clipped_power(self, function: ClippedPower) -> ParabolaBounds:
@@ -642,6 +654,7 @@ def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real,
 
     # On [0, t]: the slope of the chord; the tangent at 0 has the slope c1.
     chord = c1 + t * (c2 + t * c3)
+    # By half the second derivative in the middle of the part.
     is_convex = c2 + 1.5 * c3 * t >= 0
     u0 = l0 = c0
     u1 = c0 + dr.select(is_convex, chord, c1)
@@ -673,6 +686,7 @@ def _lines_bounding_parabolas(
     (a, b), (c, d) = lower, upper
     if _is_zero(b) and _is_zero(d):
         return lower, upper
+    # Rounded downwards (-1) and upwards (1).
     low = _minimum_or_inf(a, _shift_by_rounding(a + b * h, -1, dr.abs(a) + dr.abs(b) * h))
     high = _maximum_or_inf(c, _shift_by_rounding(c + d * h, 1, dr.abs(c) + dr.abs(d) * h))
     return (low, 0.0), (high, 0.0)

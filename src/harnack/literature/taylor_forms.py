@@ -39,8 +39,8 @@ class SinglePieceEnclosure(PiecewiseTaylorEnclosure, abc.ABC):
 
 
 class QuadraticTaylorEnclosure(SinglePieceEnclosure):
-    """The parabola that bounds f along a path, from the slope at the start and the range of F'' (F
-    is the change of f).
+    """Two parabolas bound f along a path, from above and from below. They follow from the slope at
+    the start and from the range of F'' on the whole length (F is the change of f).
 
     Source: Aydinlilar and Zanni 2023, section 6.1. Proof: that of `PiecewiseTaylorEnclosure`,
         without the line.
@@ -57,10 +57,10 @@ class QuadraticTaylorEnclosure(SinglePieceEnclosure):
 
 
 class LinearTaylorEnclosure(SinglePieceEnclosure):
-    """The line that bounds f along a path, from the range of F' on the whole length (F is the
-    change of f).
+    """Two lines through the start bound f along a path, from above and from below. Their slopes are
+    the ends of the range of F' on the whole length (F is the change of f).
 
-    Source: Aydinlilar and Zanni 2023, section 4.1, with the exact range. Proof: that of
+    Source: Aydinlilar and Zanni 2023, section 4.1; the range of F' is used as it is. Proof: that of
         `PiecewiseTaylorEnclosure`, without the parabola.
     """
 
@@ -91,5 +91,6 @@ class SegmentTracingEnclosure(SinglePieceEnclosure):
         """
         (piece,) = function.derivative_ranges([0.0, length])
         max_slope = fmax(piece.slope_range.upper, -piece.slope_range.lower)
+        # Second derivatives of 0 make the bounds the two lines of the cone.
         interval = SlopeRange(-max_slope, max_slope)
         return cls(interval, (PathPiece(piece.length, interval, 0.0, 0.0),))

@@ -85,6 +85,7 @@ def _check_branch_point(
         if period is not None:
             error = error - period * np.round(error / period)
         errors = np.fmax(errors, np.abs(error))
+    # The rounding of the bound, of the values and of the point's location.
     rounding = _ROUNDING * (bound + 1e-6 * abs(value)) + 2.0**-48 * (
         abs(value) + np.abs(point.location)
     )

@@ -70,7 +70,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     if not is_inside.any():
         return
     points, look, h = points[is_inside], look.subset(is_inside), h[is_inside]
-    has_ball = any(isinstance(promise, HarmonicBall) for promise in look.promises)
+    has_ball = any(isinstance(entry, HarmonicBall) for entry in look.promises)
     # If f is harmonic on a ball about each point, one spacing is enough.
     trials = [
         list(_stencil_samples(field, points, look, factor * h))
@@ -87,7 +87,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
         if field.variable_accuracy is None:
             raise
         # The Hessian may be the derivative of the exact gradient, without truncation error.
-        exact_trials = [_without_truncation(field, points, promise) for promise in trials]
+        exact_trials = [_without_truncation(field, points, entry) for entry in trials]
         _check_hessian(field, points, look, exact_trials)
 
 
@@ -253,6 +253,7 @@ def _check_gradient(
     stencil: the samples at the nodes of the differences.
     """
     tolerance, allowance = _limits(field, points, samples, stencil)
+    # The difference with the smaller of the two spacings.
     error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
     _require_agreement(error, tolerance, allowance, message, points, has_creases=field.has_creases)

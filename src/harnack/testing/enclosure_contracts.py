@@ -88,6 +88,7 @@ class PromiseCase:
             ranges = -promise.lower, promise.upper
             ends = promise.laplacian_lower, promise.laplacian_upper
             return kind.from_ranges(promise.radius, ranges, ends, slopes)
+        # f(p) = 0, without an error.
         return kind.from_promise(promise, type(slopes.lower)(0), 0.0, slopes)
 
     def accepts(self, kind: type[Enclosure]) -> bool:
@@ -100,6 +101,7 @@ class PromiseCase:
             for name, *_ in self.promise.units
             if not _is_infinite(getattr(self.promise, name))
         }
+        # Gaps and slope may be any numbers.
         case = PromiseCase(dataclasses.replace(self.promise, **values), 1.0, 1.0)
         return case.enclosure(kind, SlopeRange(0.0, 0.0)) is not None
 
@@ -222,6 +224,7 @@ def _positive_harmonic(
     rows: the number of functions.
     n: the dimension.
     """
+    # From 10^-3 to 10^3, evenly in the logarithm.
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes = rng.uniform(-1, 1, (rows, 3))
     # Three tenths of the rings are near a pole, where the bounds are sharp.
@@ -262,6 +265,7 @@ def _bounded_harmonic(rng: np.random.Generator, rows: int, n: int) -> RandomFunc
     The four values lie in the promised range, which has a random length; for two thirds of the
     functions each value is one of its two ends.
     """
+    # From 10^-3 to 10^3, evenly in the logarithm.
     radius, span = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     heights = np.sort(rng.uniform(0, 2, (rows, 3)), axis=1)
     is_thin = rng.random(rows) < 0.2
@@ -303,6 +307,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     the bound of `BoundedLaplacian`. The bound is attained if there is only a constant density that
     is not negative, and mass only at the poles.
     """
+    # From 10^-3 to 10^3, evenly in the logarithm.
     radius, mass = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
     # The Poisson integral of the mass is at least mass (1-q^2)/8, and a potential is at most
@@ -368,6 +373,7 @@ def _zigzag_lines(rng: np.random.Generator, rows: int) -> RandomFunctions:
     rng: a generator of random numbers.
     rows: the number of functions.
     """
+    # From 10^-3 to 10^3, evenly in the logarithm.
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     knots = np.sort(rng.uniform(0, 1, (rows, 2)), axis=1) * radius[:, None]
     # The slopes on the three parts; two fifths of the functions are straight lines of the largest
@@ -401,6 +407,7 @@ def _parabolas(rng: np.random.Generator, rows: int) -> RandomFunctions:
     rng: a generator of random numbers.
     rows: the number of functions.
     """
+    # From 10^-3 to 10^3, evenly in the logarithm.
     radius, constant = _log_uniform(rng, rows, -3, 3), _log_uniform(rng, rows, -3, 3)
     curvatures = rng.uniform(-1, 1, (rows, 2)) * constant[:, None]
     # Half of the functions have the largest possible second derivative on both parts.
@@ -457,6 +464,7 @@ def _with_random_levels(
     promise: the promise (a proved bound of f on that ball) that all functions satisfy.
     """
     rows = len(scale)
+    # From 10^-9 to 10^2 times the scale, evenly in the logarithm.
     gap_below, gap_above = (
         scale * _log_uniform(rng, rows, -9, 2),
         scale * _log_uniform(rng, rows, -9, 2),
@@ -543,7 +551,8 @@ def _meets_level(trial: RandomFunctions, length: FloatArray, precision: Precisio
     t = (1 - tolerance) * length[:, None] * fractions
     with np.errstate(all="ignore"):
         movement = trial.movement(t)
-        # An upper bound of how much rounding of its inputs changes a function.
+        # An upper bound of how much rounding of its inputs changes a function: the growth in the
+        # direction of a mass at the pole (latitude 1), in the highest dimension.
         q = np.minimum(t / trial.reach[:, None], 1 - 1e-12)
         growth = kernel_difference(q, 1.0, 4) + 1
     rounding = 0.0

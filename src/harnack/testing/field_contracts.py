@@ -147,6 +147,7 @@ def proved_free_lengths(
     below, above = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
     sample = field.prepare(backend).sample_ray(ray, backend.Float(0), length, length)
     proofs = sample.forward if forwards else sample.backward
+    # Adding 0 times an array makes one of a single number.
     steps = to_numpy(longest_free_length(proofs, LevelGaps(below, above)) + 0 * below)
     return np.broadcast_to(steps, len(points)).astype(np.float64)
 
@@ -402,6 +403,7 @@ def _check_promise(
         rounding += samples.error[:, None] + lift.error  # of both ends, also of approximations
         slope = np.einsum("nk,nk->n", samples.gradient, d)
         slopes = SlopeRange(*((slope + sign * samples.gradient_error)[:, None] for sign in (-1, 1)))
+        # (`map_numbers` also passes the exponents of each number's unit.)
         per_row = promise.map_numbers(lambda number, _, __: number[:, None])
         with np.errstate(invalid="ignore"):  # 0 * inf, at the point itself
             # The promised bounds of f(t) - f(0) at each sample.
@@ -425,6 +427,7 @@ def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatA
     backend = choose_backend("double")
     o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
     ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
+    # `clip` returns where each ray is in the domain: the first and the last position.
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
     # A little less, for rounding.
     return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)

@@ -228,10 +228,12 @@ def _newton(q: FloatArray, y: FloatArray, size: FloatArray) -> FloatArray:
 
     y, size: the position of the ball's center on the axis, and its radius.
     """
+    # The distances of the positions 0 and q from the ball's center; the potentials at q and at 0.
     distance0, distance = np.abs(y), np.abs(q - y)
     values: list[FloatArray] = []
     with np.errstate(divide="ignore", invalid="ignore"):
         for d in (distance, distance0):
+            # Outside of the ball it is the potential of a point mass.
             values.append(np.where(d > size, size**3 / (3 * d), 0.5 * size**2 - d * d / 6))
         difference = q * (2 * y - q) / 6  # free of cancellation where both are inside
         return np.where((distance0 <= size) & (distance <= size), difference, values[0] - values[1])

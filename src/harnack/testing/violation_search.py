@@ -85,6 +85,7 @@ class FieldSamples:
 
     def subset(self, rows: BoolArray) -> FieldSamples:
         """The samples at some of the points, given by a mask or by indices."""
+        # `map_numbers` also passes the exponents of each number's unit, which are not used here.
         return FieldSamples(
             self.value[rows],
             self.gradient[rows],
@@ -110,6 +111,7 @@ def sample_field(
     # In one kernel for all of them.
     dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers)
 
+    # (`map_numbers` also passes the exponents of each number's unit.)
     promises = tuple(
         promise.map_numbers(lambda number, _, __: _to_lanes(number, n))
         for promise in sample.all_promises
@@ -185,7 +187,8 @@ def accumulated_jumps(
     jumps = field.prepare(backend).jumps
     assert jumps is not None
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
-    # The crossing before the first one is at the start of the ray, on no facet.
+    # The crossing before the first one is at the start of the ray, on no facet: with the jump 0 and
+    # any vector as normal.
     first, last = (backend.Float(np.ascontiguousarray(lengths[:, k])) for k in (0, -1))
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
@@ -463,6 +466,7 @@ class _ViolationSearch:
             # bounds, which for the latter is the linear part of f.
             if not promise.holds_outside_domain:
                 middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+                # For a Lipschitz constant the middle is 0, and the gradient does not enter.
                 error = error + at_p.gradient_error * distance * (middle != 0)
                 return (np.abs(moved - middle) - error) / half
             max_fall, max_rise = error - lower, error + upper
@@ -503,6 +507,8 @@ class _ViolationSearch:
         fine, wide = np.zeros(len(y)), np.zeros(len(y))
         rounding = 4 * at_y.gradient_error / h
         for axis in range(3):
+            # Nodes at 1 and 2 spacings. The weights of the difference with the spacing h, and of
+            # the one with 2h, which is divided by 2h once more.
             for node, weight, wide_weight in ((1, 1.0, 0.0), (2, 0.0, 0.5)):
                 offset = (node * h)[:, None] * np.eye(3)[axis]
                 rate = (

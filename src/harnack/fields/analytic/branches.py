@@ -193,6 +193,7 @@ class PlaneSegment(PlaneRegion):
             dr.sqrt(dr.square(x + position * self.w.real) + dr.square(y + position * self.w.imag))
             for position in (0.0, foot_position, self.length)
         )
+        # For the rounding of z, and of the computation.
         slack = self.rounding + 1e-6 * start
         return fmax(fmin(foot_distance, start) - slack, 0), fmax(end, start) * (1 + 1e-6) + slack
 
@@ -461,6 +462,7 @@ class PowerProduct(Branches):
         """
         log_nearest: list[Real] = []
         log_farthest: list[Real] = []
+        # `disk` returns center and radius. Here they only tell the types of Dr.Jit numbers.
         for a in self._centers(part.disk()[0]):
             smallest, largest = part.distances(a)
             log_nearest.append(dr.log(smallest))
@@ -479,6 +481,7 @@ class PowerProduct(Branches):
                     for k, power in enumerate(powers)
                     if power != 0
                 ]
+                # Without any power (g is a quadratic polynomial) |g"| is this one constant term.
                 bound = bound + factor * dr.exp(sum(logs)) if logs else factor
         return bound * _BOUND_MARGIN
 

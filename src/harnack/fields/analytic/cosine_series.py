@@ -179,12 +179,14 @@ class CosineBounds:
         curvature = float(norms.max()) * grid_factor * (1 + _ROUNDING)
         cells: list[CellBounds] = []
         for count in _CELLS:
+            # The largest norm at the nodes of each cell and of its neighbors (margin 1).
             local = _cell_extremes(norms, angles, count, 1, np.maximum) + relative_error * curvature
             local = np.minimum(local * (1 + _ROUNDING), curvature)
             if float(local.mean()) <= _MAX_RATIO * curvature:
                 # x is the first index in `_cell_extremes` and runs fastest on the device.
                 cells.append(CellBounds(count, np.ascontiguousarray(local.T).ravel()))
         margin = relative_error * half_range + _ROUNDING * (abs(mid_value) + half_range)
+        # The range of f on each cell alone (margin 0) comes last.
         return cls(
             mid_value - half_range,
             mid_value + half_range,
@@ -528,6 +530,7 @@ def _sum_plane(
                 dr.fma(coefficient, cos_z[k], inner_sum),
                 dr.fma(coefficient, slope_z[k], inner_slope),
             )
+            # cos(k w) for k = 0 is constant.
             if second and k:
                 inner_second = dr.fma(coefficient * float(-k * k), cos_z[k], inner_second)
         sums[0] = dr.fma(inner_sum, cos_y[j], sums[0])

@@ -106,6 +106,7 @@ class FourierSeries(Field):
         _check_terms(checked.shape)
         if not np.isfinite(checked).all():
             raise ValueError("coefficients must be finite numbers")
+        # Entry 0 is the constant term.
         if not np.any(checked.ravel()[1:]):
             raise ValueError("the series is constant: it has no level sets")
         self.coefficients = checked
@@ -254,6 +255,7 @@ class FourierSeries(Field):
         points_on_surface = points_on_surface[
             difference <= _CONVERGED * float(self._size.max()) * slope
         ]
+        # On the surface the series has the value `level`.
         return points_on_surface, (
             _values(self._source, points_on_surface) if len(points_on_surface) else np.zeros(0)
         ) - level
@@ -262,6 +264,7 @@ class FourierSeries(Field):
         """The largest |series - fitted function|, at random points of the box if a callable was
         fitted, at all points of the grid if a grid was."""
         if callable(self._source):
+            # With the seed 0, so that the result is always the same.
             points = self._lower + self._size * np.random.default_rng(0).random((_CHECK_POINTS, 3))
             values = _values(self._source, points)
         else:
@@ -298,11 +301,13 @@ class FourierSeries(Field):
         series = self._on(p)
         value, gradient = series.value(p)
         roundoff = float(dr.epsilon(type(value))) * _SECOND_ORDER
-        # The rounding of p - lower, times pi/size, moves the point.
+        # The rounding of an angle, (p - lower) pi/size, moves the point: three roundings of p -
+        # lower (of the difference, of pi/size and of the product), and that of `lower`.
         moves = [
             dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
         ]
         error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
+        # Entry 0 of `rounding` is for the value, entry 1 for the gradient.
         error = roundoff * (error + series.rounding[0])
         move_length = dr.norm(series.backend.Array3f(*moves))
         # A move of the point changes the gradient by at most the bound of second derivatives times
@@ -435,6 +440,8 @@ def _rounding(coefficients: FloatArray, size: FloatArray) -> tuple[float, float]
     size: (3,) the lengths of the box's sides.
     """
     i, j, k = np.indices(coefficients.shape)
+    # Of a term: its angles are at most i pi, j pi and k pi; 2 for each of three sines or cosines, 1
+    # for the coefficient, and i + j + k + 3 sums.
     roundings = (i + j + k) * (math.pi + 1) + 10
     abs_coefficients = np.abs(coefficients)
     slopes = [

@@ -97,6 +97,7 @@ class _OrderTerm:
         """
         bounds = value_bound(weights), gradient_bound(weights), hessian_bound(weights)
         rounding = HarmonicRounding.of(weights, is_divided=True)
+        # The second and the third are the n and the k of C_n^k.
         return cls(j, l - j, j + 1, weights, *bounds, rounding)
 
     def largest(self, rho: Real, r: Real) -> tuple[Real, Real]:
@@ -106,6 +107,7 @@ class _OrderTerm:
 
         C and its derivatives are largest at w = 1.
         """
+        # C, C' and C'' at w = 1; below, bounds of S, of its gradient and of its Hessian.
         c, first, second = (float(number) for number in self.axial(1.0))
         value, slope, curvature = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
         return slope * c + value * first, curvature * c + slope * first + value * second
@@ -263,6 +265,7 @@ class HypersphericalHarmonic(Field):
         zero = 0 * p.x
         value, gradient_sum, radial_sum = zero, type(p)(0), zero
         error, gradient_error = zero, zero
+        # The roundings of a term: a few for its products, and one for each sum over the parts.
         operations = len(self._orders) + 8.0
         for term in self._orders:
             # C(w), C'(w) and C''(w)
@@ -327,12 +330,17 @@ class HypersphericalHarmonic(Field):
         max_gradient = l * self._range.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
-            # By the chain rule, with the smallest 1 + |q|^2 of the ball (see the class).
+            # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed
+            # 2/Q and has a second derivative of the length 4/Q^1.5; on S^3 the gradient of P is at
+            # most l M and its Hessian l (l-1) M, where M is the largest |P|. So second derivatives
+            # are at most M l (4 (l-1)/Q^2 + 4/Q^1.5), with the smallest Q of the ball.
             min_square = self._min_square(square, fraction)
+            # It is negative for l = 0, where f is constant; hence the maximum with 0 below.
             second = (4 * (l - 1) / min_square + 4 / dr.sqrt(min_square)) / min_square
             promises.append(
                 TaylorRemainder(fmax(max_gradient * second, 0), self._radius(square, fraction))
             )
+        # In all of space 1 + |q|^2 is at least 1.
         return [*promises, TaylorRemainder(0 * square + max(max_gradient * 4.0 * l, 0.0), dr.inf)]
 
     def _remainder_near_zero(self, p: Vec3, square: Real) -> tuple[TaylorRemainder, ...]:
@@ -342,8 +350,9 @@ class HypersphericalHarmonic(Field):
 
         square: |p|^2.
         """
-        # By the chain rule, as in the class, with bounds of S(y) C(w) at all points within the
-        # chord.
+        # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed 2/Q
+        # and has a second derivative of the length 4/Q^1.5. Derivatives of S(y) C(w) are bounded at
+        # all points of S^3 within a chord.
         axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
         center_order = min(term.j for term in self._orders)
         if center_order < 3:
@@ -392,7 +401,9 @@ class HypersphericalHarmonic(Field):
         position = dr.dot(p, path.direction)
         l, sqrt_square = self.degree, dr.sqrt(square)  # noqa: E741
         bounds = self._range
-        # Two bounds of |f_aa|, the second derivative by the angle on the circle.
+        # Two bounds of |f_aa|, the second derivative by the angle on the circle. By the chain rule,
+        # as the circle has the radius 1/c with c^2 = `square`; and by Bernstein's inequality, as f
+        # is a trigonometric polynomial of degree l of the angle.
         bernstein_bound = l * l * 0.5 * (bounds.high - bounds.low)
         second = fmin(
             bounds.largest * l * ((l - 1) / square + 1 / sqrt_square), bernstein_bound

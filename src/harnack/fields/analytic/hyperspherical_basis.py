@@ -126,7 +126,7 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
     Raises:
         ValueError: the polynomial is not homogeneous, of a degree above 6, zero, or not harmonic.
     """
-    degrees = sorted({sum(powers) for powers, z_nodes in coefficients.items() if z_nodes != 0})
+    degrees = sorted({sum(powers) for powers, entry in coefficients.items() if entry != 0})
     if not degrees:
         raise ValueError("the polynomial is zero: it has no level sets")
     if len(degrees) > 1:
@@ -163,6 +163,8 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
     for j in range(l + 1):
         axial = norm(l, j) * gegenbauer(l - j, j + 1, w)
         for m in range(-j, j + 1):
+            # P_ljm at the nodes. (The first result of `evaluate` is the value; 0 w makes an array
+            # of it.)
             basis = axial * (evaluate({(j, m): 1.0}, *y)[0] + 0.0 * w)
             # The projection to P_ljm, which is subtracted.
             weights[j, m] = float(quadrature_weights @ (values * basis))
@@ -224,7 +226,8 @@ class HypersphereRange:
         values = np.zeros((_SLICES, sphere.shape[1]))
         pole = 0.0
         for j, harmonic_weights in weights_by_order(l, weights).items():
-            # The added 0 makes an array of a constant.
+            # The value of the harmonic, without its gradient; the added 0 makes an array of a
+            # constant.
             harmonic = evaluate(harmonic_weights, *sphere)[0] + 0.0 * sphere[0]
             # A point of S^3 is (sin(a) q, cos(a)) with q on S^2, and the harmonic has degree j.
             values += (

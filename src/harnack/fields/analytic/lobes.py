@@ -129,9 +129,11 @@ class Lobes(Field):
         if not is_one_of(sign, _SIGNS):
             raise ValueError(f"part must be one of {', '.join(_SIGNS)}, not {sign!r}")
         self.scale, self.part = scale, sign
+        # `prepare` puts a number of the backend in its place.
         self._size: Any = self.scale
         (first_harmonic, *other_harmonics) = self.weights
         if other_harmonics:
+            # The range of the sum of solid harmonics on the unit ball, which contains the sphere.
             value_range = BallRange.of(self.weights).with_spheres(self.weights, 1.0).on_ball(1.0)
         else:
             # A single harmonic has a sharper range. A negative weight exchanges its ends.
@@ -139,6 +141,7 @@ class Lobes(Field):
             low, high = (weight * end for end in range_of_harmonic(*first_harmonic))
             value_range = min(low, high), max(low, high)
         self.value_range = value_range
+        # The rounding of the division x/|x| is counted in `_errors`.
         self._rounding = HarmonicRounding.of(self.weights, is_divided=False)
         if self.extent_radius() <= 0:
             raise ValueError(f"there is no direction in which the function is {sign}")
@@ -353,6 +356,7 @@ class Lobes(Field):
         # The errors of Y and of its gradient; 8 L M and 8 L^2 M in them come from the unit vector.
         roundoff = float(dr.epsilon(type(r)))
         max_value, degree = max(map(abs, self.value_range)), self.degree
+        # The direction is at the distance 1 from the origin.
         y_error = roundoff * (self._rounding.value_error(rho, 1.0) + (8 * degree + 4) * max_value)
         slope_error = roundoff * (
             2 * self._rounding.gradient_error(rho, 1.0)
@@ -397,7 +401,7 @@ class Lobes(Field):
                 rows.append(row)
         else:
             # The Hessian of r^3 is 3 r I + 3 r u u^T; that of r^2 Y does not depend on r.
-            root_hessian = self._of_power(u, 2)[2]
+            root_hessian = self._of_power(u, 2)[2]  # here of r^2 Y
             for k in range(3):
                 row = 3 * r * u[k] * u - sign * root_hessian[k]
                 row[k] += 3 * r

@@ -116,6 +116,7 @@ class ExtensionBounds:
         length_unit = 1 / math.sqrt(
             float(amplitudes**2 @ wavenumbers**2) / float(amplitudes @ amplitudes)
         )
+        # Radii from 0.02 to about 7 length units.
         steps = (length_unit * 0.02 * 1.02**n for n in range(300))
         radii = [
             r for r in steps if r * float(wavenumbers.max()) < 30.0
@@ -168,7 +169,9 @@ class ExtensionBounds:
 
     def _max_descent(self, f: Real, rise: Real) -> Real:
         """An upper bound of -F on the ball of R^4 about p, where F is the harmonic extension of f
-        to four dimensions. With -f in place of f, it is a bound of F. The class has the proof.
+        to four dimensions. With -f in place of f, it is a bound of F. With x = |y-p|/R and the
+        numbers alpha and E (`spread`), -F is at most h(x) = (1 + alpha (1-x^2)) (Dx - f) + (1-x^2)
+        E where Dx > f, and at most Dx - f + (1-x^2) E elsewhere; the class has the proof.
 
         f: the value at p, without the constant term.
         rise: the number D, for which |f(y) - f(p)| <= D |y-p|/R at all points y of space in the
@@ -296,8 +299,9 @@ class EigenfunctionSum(Field):
             ),
         )
         alternatives = (self._extension.ball(value, gradient_norm_bound), lipschitz)
-        # The effects of the gradient's rounding: E^2/(2 h H) for Taylor's formula, and the rest of
-        # E R for the harmonic ball.
+        # The effects of the gradient's rounding error E: E^2/(2 h H) for Taylor's formula, with the
+        # bound H of second derivatives and h = `_SLOPE_SHARE`; and for the harmonic ball of radius
+        # R the part of E R that the proofs on balls do not allow for themselves.
         error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
         error += fmax(gradient_error * self._extension.radius - self._rounding_bound * epsilon, 0)
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)
@@ -433,7 +437,11 @@ class Gyroid(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the three products of a sine and a cosine of the class."""
+        """Set up the sum of the three products sin X cos Y, sin Y cos Z and sin Z cos X.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (WaveProduct(1.0, x=s, y=c), WaveProduct(1.0, y=s, z=c), WaveProduct(1.0, z=s, x=c))
@@ -454,7 +462,11 @@ class SchwarzP(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the three cosines of the class."""
+        """Set up the sum of the three cosines cos X, cos Y and cos Z.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         c = cosine_factor(_wavenumber(cell))
         super().__init__(
             cell, (WaveProduct(1.0, x=c), WaveProduct(1.0, y=c), WaveProduct(1.0, z=c)), domain
@@ -479,7 +491,12 @@ class SchwarzD(_CubicSurface):
     _steepness = math.sqrt(3.0)
 
     def __init__(self, cell: float = 2 * math.pi, *, domain: Volume | None = None) -> None:
-        """Set up the four products of sines (s) and cosines (c) of the class."""
+        """Set up the sum of the four products s s s, s c c, c s c and c c s, where s and c are the
+        sines and cosines of X, Y and Z.
+
+        cell: the length after which f repeats along each axis.
+        domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
+        """
         k = _wavenumber(cell)
         s, c = sine_factor(k), cosine_factor(k)
         terms = (

@@ -397,10 +397,11 @@ class LevelCurves(Field):
             second_bound = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (
                 1 + 1e-4
             )
+            # By Taylor's formula.
             change = (gradient_norm * radius + 0.5 * second_bound * radius * radius) * (1 + 1e-5)
             promises += [
                 TaylorRemainder(second_bound, radius),
-                HarmonicBall(radius, value - change, value + change, 2),
+                HarmonicBall(radius, value - change, value + change, 2),  # 2: of the plane
             ]
         return Sample(value, gradient, tuple(promises), backend_of(p).machine_epsilon * error_units)
 
@@ -423,10 +424,12 @@ class LevelCurves(Field):
         """Evaluate g at the projections of the points p to the complex plane.
 
         Returns a bound of the rounding error of the projection (a distance), the projection as a
-        complex number, moved off singular points, and g and its derivatives there.
+        complex number, moved off singular points, and the only branch of g, with its derivatives,
+        there.
         """
         rounding = 4 * backend_of(p).machine_epsilon * max_norm(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
+        # There is one branch only (other values of g differ from it by whole periods).
         return rounding, z, self.branches.evaluate(z)[0]
 
 
@@ -500,7 +503,7 @@ class HeightField(Formula):
         if not (np.isfinite([lowest, highest]).all() and (lowest > lower[2] or highest < upper[2])):
             return self.domain
         bottom, top = max(lowest, lower[2] - slack), min(highest, upper[2] + slack)
-        # No level set meets the domain.
+        # No level set meets the domain, so that any volume contains them.
         if bottom >= top:
             return self.domain
         left, front = (float(coordinate) for coordinate in lower[:2])
@@ -524,7 +527,9 @@ class HeightField(Formula):
         )
         # The longer side, as the boxes of the jets are cubes.
         half_side = backend.Float(0.5 * float(size.max()) * (1 + 1e-9))
+        # The ranges of x, y and z over a cube around each cell; only those of x and y are used.
         jets = Jet.over_ball(to_vector3(backend, centers, "points"), half_side)
+        # `as_jet` makes a jet of a height that is a plain number.
         heights = as_jet(self.function(*jets[:2]), jets[0], "HeightField").value
         # The added 0 makes an array of a constant.
         lowest = to_numpy(0 * half_side + dr.min(heights.lower)).min()

@@ -113,6 +113,7 @@ class HarmonicPromises:
         known: proved ranges of the parts of f of each degree.
         is_divided: whether points are divided by a size other than 1 first, which adds rounding.
         """
+        # The radii of the balls about the origin, and about a point of the unit sphere.
         center_radius, boundary_radius = _best_radius(known, 0.0), _best_radius(known, 1.0)
         order, axial_bounds, axis_share = order_on_axis(weights), None, 0.0
         if order > 2:
@@ -124,13 +125,16 @@ class HarmonicPromises:
                 gradient_bound(nonconstant),
                 hessian_bound(nonconstant),
             )
+            # The largest |f - constant| on the unit ball.
             lower, upper = known.by_degree(1.0)
             max_value = max(upper - known.constant, known.constant - lower)
             # If rho = axis_share r, both bounds of a single term are the same.
             axis_share = (max_value / float(axial_bounds[0](1.0, 1.0))) ** (1 / order)
+        # The spheres reach a little beyond the largest ball about the origin that is needed: that
+        # around a harmonic ball at r = 0 or at r = 1.
         return cls(
             known.with_spheres(weights, 1.01 * max(center_radius, 1.0 + boundary_radius)),
-            max(degree for degree, _ in weights),
+            max(degree for degree, _ in weights),  # the degree, and the lowest degree but 0
             min((degree for degree, _ in weights if degree > 0), default=0),
             order,
             center_radius,
@@ -148,6 +152,7 @@ class HarmonicPromises:
         radius = self._radius(rho, r)
         lower, upper = self.ball_range.at(r + radius)
         if self.axial is not None:
+            # `axial` has bounds of |f - constant|, of |grad f| and of the Hessian.
             axial_bound = self.axial[0](rho + radius, r + radius) * (1 + _ROUNDING)
             lower = fmax(lower, self.ball_range.constant - axial_bound)
             upper = fmin(upper, self.ball_range.constant + axial_bound)
@@ -162,6 +167,7 @@ class HarmonicPromises:
         """
         radii = [dr.inf]  # where the Hessian is constant
         if self.degree > 2:
+            # Second derivatives, about r^(degree - 2), grow by a factor of e on this length.
             scale = r / (self.degree - 2)
             radii = [_NEAR * scale, fmax(_WIDE * scale, _FLOOR)]
             # Near an axis of high order, a smaller ball has a much smaller bound.
@@ -175,11 +181,14 @@ class HarmonicPromises:
         rho, r: the distances of the point from the z axis and from the origin.
         """
         if self.degree < 3:
+            # Second derivatives are constant, so the ball about the origin may have the radius 0.
             bound = self.ball_range.curvature(0.0 * r)
         else:
             bound = self.ball_range.curvature(r + radius)
         if self.axial is not None:
+            # Entry 2 of `axial` is the bound of the Hessian near the z axis.
             bound = fmin(bound, self.axial[2](rho + radius, r + radius))
+        # The share covers the rounding of the gradient: see `error`.
         return dr.fma(bound, 1 + _ROUNDING + _SLOPE_SHARE, self._underflow(r))
 
     def lipschitz(self, rho: Real, r: Real) -> Lipschitz | None:
@@ -194,6 +203,7 @@ class HarmonicPromises:
         radius = fmax(r * (_WIDE / (self.degree - 2)), _FLOOR)
         bound = self.ball_range.gradient(r + radius)
         if self.axial is not None:
+            # Entry 1 of `axial` is the bound of the gradient near the z axis.
             bound = fmin(bound, self.axial[1](rho + radius, r + radius))
         return Lipschitz(dr.fma(bound, 1 + _ROUNDING, self._underflow(r)), radius)
 
@@ -292,6 +302,7 @@ class _SolidHarmonics(Field):
         self._weights = weights
         self._size = size
         self._promises = HarmonicPromises.of(weights, known, is_divided=size != 1.0)
+        # On the ball |p| <= size, in units of the size.
         self.value_range = known.with_spheres(weights, 1.0).on_ball(1.0)
 
     @property

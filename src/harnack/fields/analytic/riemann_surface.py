@@ -51,7 +51,8 @@ _BOUND_MARGIN = 1 + 1e-4
 @dataclass(frozen=True)
 class _BranchValue:
     """One branch of a function at a point p of space: phi = h - u, where h is the height of p and u
-    the height of this branch's surface over the same point of the plane.
+    the height of this branch's surface over the same point of the plane. The gradient of phi is (x,
+    y, 1): the attributes x and y are the derivatives of phi, that is, of -u.
 
     phi: the value of phi.
     x, y: the derivatives of phi by x and y, which are those of -u. The derivative by z is 1.
@@ -79,6 +80,7 @@ class _BranchValue:
         On a line of symmetry two branches agree in phi and in its derivative by x but not by y;
         they do not coincide, and f has a crease there.
         """
+        # x and y are the derivatives of phi; its derivative by the height is 1.
         return (self.phi == other.phi) & (self.x == other.x) & (self.y == other.y)
 
 
@@ -189,6 +191,7 @@ class RiemannSurface(Field):
             period=period,
         )
         self.branches: Branches = make_branches(**self._branch_arguments)
+        # The radius of the default domain.
         radius = {"log": 4.0, "asin": 2.0}.get(function, 1.0) if isinstance(function, str) else 1.0
         self.domain = Ball(radius=radius) if domain is None else domain
         self._height: Any = self.height
@@ -347,7 +350,7 @@ class RiemannSurface(Field):
         branches = self.branches.evaluate(z)
         graphs = self._graphs(p, branches)
         u_xx, u_xy = 0 * p.x, 0 * p.x
-        at_p = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)
+        at_p = self._nearest_branch(z, p.z, graphs, 0.0, 0.0)  # the errors are not used here
         for k, graph in enumerate(graphs):
             # With a period each branch gives two graphs, the second half of the list.
             second = branches[k % len(branches)].second
@@ -433,6 +436,7 @@ class RiemannSurface(Field):
         rounding = self._rounding(p)
         z = self.branches.move_off_singularities(complex_of(p.x, p.y), rounding)
         branches = self.branches.evaluate(z)
+        # The errors of u and of the height of p.
         error_units = self._height_factor * self.branches.value_rounding(z, branches) + 4 * dr.abs(
             p.z
         )
@@ -486,6 +490,8 @@ class RiemannSurface(Field):
         """
         nearest, sign = local.nearest, local.sign
         vector = backend_of(nearest.phi).Array3f
+        # The gradient of phi = h - u is (x, y, 1), where x and y are the derivatives of -u. f is
+        # sign phi.
         gradient = vector(sign * nearest.x, sign * nearest.y, sign)
         # No hit if the surface is proved to be farther away than f/|grad f|.
         norm, distance = dr.norm(gradient), self._proved_distance(local)
@@ -553,6 +559,8 @@ class RiemannSurface(Field):
                 approach_rate = fmax(-dr.mulsign(d.z, height), 0)
             gap = fmax(dr.abs(height) - local.error, 0)
             inner_radius = 0 * height + point.radius * (1 - 1e-6) - local.rounding
+            # The bound of the heights near the branch point: its power, its constant, and the
+            # radius within which it holds.
             bound = (point.power, self._height_factor * point.constant * (1 + 1e-5), inner_radius)
             distance = dr.abs(local.nearest.phi)
             enclosures.append(
@@ -622,6 +630,7 @@ class RiemannSurface(Field):
             where phi is the height of the point above `branch`. It includes the rounding of the
             derivative."""
             slope = branch.slope(d)
+            # The gradient of phi is (x, y, 1).
             size = dr.abs(branch.x * d.x) + dr.abs(branch.y * d.y) + dr.abs(d.z)
             return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
 

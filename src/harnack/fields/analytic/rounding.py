@@ -116,6 +116,7 @@ class HarmonicRounding:
                     terms[i, degree - i] = terms.get((i, degree - i), 0.0) + factor * constant
             underflow += 2.0 + factor * _underflow(l, m)
         a, b, c, d = (AxialBound.of(terms) for terms in tables)
+        # A pair for the value and one for the gradient: near the z axis, and anywhere.
         return cls((a, b), (c, d), underflow)
 
     def value_error(self, rho: Real, r: Real) -> Real:
@@ -142,11 +143,13 @@ def _recurrence(l: int, m: int) -> tuple[FloatArray, FloatArray, float]:  # noqa
     of step k has grown at step l) times the sum of the step's coefficients plus 2.
     """
     cosine, _ = polar_samples(_SAMPLES)
+    # On the unit sphere z is the cosine, and r^2 is 1.
     q = Legendre(cosine, 1.0)
     zeros, ones = 0.0 * cosine, 0.0 * cosine + 1.0
     if l < m:
         return zeros, zeros, 0.0
-    # For each step k: the error that it adds, and its growth G_lk up to step l.
+    # For each step k: the error that it adds, 4u |A z q_(k-1)| + 7u |B r^2 q_(k-2)| with the two
+    # coefficients A and B, and its growth G_lk up to step l, by the same recurrence.
     error, underflow_factor = zeros.copy(), 0.0
     for k in range(m + 1, l + 1):
         z_coefficient, square_coefficient = (2 * k - 1) / (k - m), (k + m - 1) / (k - m)
@@ -179,8 +182,11 @@ def _value_errors(l: int, m: int, addition_count: int, is_divided: bool) -> tupl
     """
     abs_q, q_error, _ = _recurrence(l, m)
     cosine, sine = polar_samples(_SAMPLES)
+    # The error of Q; then 3u for the weight and two products, u for each addition, and the error of
+    # (x + iy)^m.
     total = q_error + (3 + addition_count + _complex_power_error(m)) * abs_q
     if is_divided:
+        # |q_(l-1)| of the orders m + 1 and m.
         at_next, at_lower = _recurrence(l - 1, m + 1)[0], _recurrence(l - 1, m)[0]
         # 3u (rho |f_rho| + |z f_z|), by the derivatives of Q rho^m.
         total = total + 3 * (
@@ -284,6 +290,7 @@ class WaveRounding:
         """Compute the bounds of the rounding errors that `evaluate_terms` makes when it sums these
         terms of waves."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
+        # Each list has four numbers: a constant, and the factors of |x|, |y| and |z|.
         value, gradient, total_slopes, hessian = ([0.0] * 4 for _ in range(4))
         value_sum, slope_sum, second_sum = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
@@ -301,6 +308,7 @@ class WaveRounding:
             partial_sums = (
                 (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
             )  # the first sum is exact
+            # The added 2 and 6 are roundings of the factors that differentiation adds.
             value[0] += amplitude * (angle_error + other_errors) + partial_sums[0]
             gradient[0] += amplitude * norm * (angle_error + other_errors + 2) + partial_sums[1]
             hessian[0] += second_size * (angle_error + other_errors + 6) + partial_sums[2]
@@ -322,6 +330,7 @@ class WaveRounding:
         gradient: the computed gradient at p.
         """
         abs_p = [dr.abs(p.x), dr.abs(p.y), dr.abs(p.z)]
+        # Entry 0 of a bound is a constant, entries 1 to 3 are factors of |x|, |y| and |z|.
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
             if self.move[axis] > 0:
@@ -390,7 +399,7 @@ def _term_roundings(term: Term, common: Sequence[float | None]) -> tuple[float, 
 
     Returns three results: the part of the errors of its angles that is constant; for each axis, the
     part that is proportional to the absolute value of that coordinate, as a factor; and the error
-    of the other operations.
+    of the other operations. `WaveRounding` derives the numbers.
     """
     if isinstance(term, PlaneWave):
         operations = _SINE + 2

@@ -88,6 +88,7 @@ class Legendre:
         Q_(l-2).
         """
         if l <= m:
+            # Q_m^m is (2m-1)!!.
             return 1.0 if l == m else 0.0
         if (l, m) not in self._known:
             previous, before_previous = self(l - 1, m), self(l - 2, m)
@@ -128,6 +129,7 @@ def evaluate(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, tuple[Any, 
             c_lower, s_lower, c, s = c, s, x * c - y * s, x * s + y * c
         # The orders m and -m. dx and dy are the derivatives of C_m or S_m, divided by m.
         for order, basis, dx, dy in ((m, c, c_lower, -s_lower), (-m, s, s_lower, c_lower)):
+            # The order 0 has no sine. (Its second turn would count the cosine's weights again.)
             if m == 0 and basis is s:
                 continue
             degree_weights = [
@@ -178,6 +180,7 @@ def hessian(weights: Weights, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any, An
             (m, (c, m * c1, -m * s1, falling_product * c2, -falling_product * s2)),
             (-m, (s, m * s1, m * c1, falling_product * s2, falling_product * c2)),
         )
+        # The order 0 has no sine.
         for order, basis in bases[: 2 if m else 1]:
             degree_weights = [
                 (key[0], weight) for key, weight in weights.items() if key[1] == order
@@ -215,6 +218,7 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power
         m * (m - 1) * power(m - 2) * math.cos((m - 2) * azimuth),
         -m * (m - 1) * power(m - 2) * math.sin((m - 2) * azimuth),
     )
+    # A single term with the weight 1; on the unit sphere r^2 is 1.
     sums = _hessian_sums([(l, 1.0)], m, Legendre(z, 1.0))
     # The added 0 makes arrays of constants.
     xx, yy, zz, xy, xz, yz = (entry + 0.0 * z for entry in _hessian_of_sums(sums, basis, x, y))
@@ -338,6 +342,7 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     sample_count = 64
     angles = 2 * np.pi * np.arange(sample_count) / sample_count
     x, y = np.cos(angles), np.sin(angles)
+    # On the circle z is 0 and r^2 is 1.
     legendre = Legendre(0.0, 1.0)
     weights: dict[tuple[int, int], float] = {}
     for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741

@@ -229,6 +229,7 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     if l == 0:
         return 0.0
     z, rho = polar_samples()
+    # On the unit sphere r^2 is 1.
     q = Legendre(z, 1.0)
     at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
     if m == 0:
@@ -285,6 +286,7 @@ def unit_sphere(covering: float) -> FloatArray:
     with sin b <= sin a + h/2.
     """
     chord = 2 * math.sin(0.5 * min(covering, math.pi))
+    # The step h is less than 1.4 chord, so that h/2 is less than the chord, and w below is not 0.
     ring_count = math.ceil(math.pi / (1.4 * chord)) + 1
     h = math.pi / ring_count
     points: list[FloatArray] = []
@@ -344,6 +346,7 @@ def range_of_harmonic(l: int, m: int) -> tuple[float, float]:  # noqa: E741
     """
     sample_count = 8192
     polar_angle = 2 * np.pi * np.arange(sample_count) / sample_count
+    # The first result of `evaluate` is the value, the second the gradient.
     values = evaluate(
         {(l, abs(m)): 1.0}, np.sin(polar_angle), 0.0 * polar_angle, np.cos(polar_angle)
     )[0]
@@ -476,8 +479,10 @@ def _points(weights: Weights) -> tuple[FloatArray, float]:
 
 def _values(weights: Weights, points: FloatArray) -> dict[int, FloatArray]:
     """The values (n,) of the part f_l of each degree l at points (3, n) of the unit sphere, as a
-    mapping l -> values. f is the sum of solid harmonics with these weights."""
+    mapping l -> values. f is the sum of solid harmonics with these weights, a mapping (l, m) ->
+    coefficient."""
     degrees = sorted({degree for degree, _ in weights})
+    # The first result of `evaluate` is the value, the second the gradient.
     return {
         degree: evaluate({k: w for k, w in weights.items() if k[0] == degree}, *points)[0]
         for degree in degrees

@@ -211,7 +211,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
         if isinstance(term, PlaneWave):
             k = term.wave_vector
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
-            wave = term.amplitude * sincos(angle)[1]
+            wave = term.amplitude * sincos(angle)[1]  # times the cosine
             for i, j in upper:
                 if k[i] * k[j] != 0:
                     upper[i, j] -= k[i] * k[j] * wave
@@ -305,7 +305,11 @@ class WaveBounds:
         curvature = float(np.linalg.eigvalsh(matrix)[-1]) * margin
         lengths = np.linalg.norm(wave_vectors, axis=1)
         value = float(absolute_amplitudes.sum()) * margin
+        # The second bound: by Cauchy-Schwarz, (sum A_i |k_i . v|)^2 is at most sum A_i times sum
+        # A_i (k_i . v)^2.
         gradient = min(float(absolute_amplitudes @ lengths) * margin, math.sqrt(value * curvature))
+        # The last one bounds third derivatives: their terms are those of second derivatives, each
+        # times at most the largest |k_i|.
         return cls(
             tuple(float(v) for v in lengths),
             tuple(float(v) for v in absolute_amplitudes),

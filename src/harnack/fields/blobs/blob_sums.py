@@ -287,6 +287,7 @@ def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach)
         offset = _vector_to_center(p, row) * inverse_radius
         q = dr.dot(offset, offset)
         scale = amplitude * inverse_radius * inverse_radius
+        # The second result of `profile` is dk/dq.
         diagonal = 2 * scale * kernel.profile(q)[1]
         mixed = 4 * scale * kernel.second_derivative(q)
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -335,6 +336,7 @@ def _add_value(
     gradient_factor = -2 * slope * inverse_radius
     # A little more than the support, so that rounding leaves out no blob.
     is_inside = q < 1.001
+    # In the call of `lipschitz_fraction` the line passes through the center, so S^2 is 1.
     abs_amplitude = dr.abs(amplitude)
     return (
         dr.fma(amplitude, k, value),

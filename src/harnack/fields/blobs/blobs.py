@@ -214,7 +214,7 @@ class Blobs(Formula):
         # The proofs are asked first at which knots they want ranges of derivatives; those are then
         # computed in the one loop over the blobs.
         recorder = KnotRecorder(piece_count)
-        no_slope = SlopeRange(0.0, 0.0)
+        no_slope = SlopeRange(0.0, 0.0)  # in place of the slope, which is not needed for this
         path.proofs.from_restriction(recorder, no_slope, ahead)
         # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
@@ -278,6 +278,7 @@ class Blobs(Formula):
         term = blob_term(self.kernel, (x, y, z))
         if data.groups is None:
             return sum_jets(term, x, zero, for_each_record(data.records))
+        # The list of all blobs.
         return group_maximum_jet(term, x, zero, data.grouped(None))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
@@ -346,6 +347,7 @@ class _BlobDeviceData:
             None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
+            # `max_path_length`: twice the diagonal of the blobs' box.
             dr.opaque(backend.Float, 2 * float(np.linalg.norm(upper - lower))),
         )
 
@@ -364,6 +366,7 @@ class _BlobDeviceData:
         group_of_blob, count = self.groups
         # All records of the table, which are sorted by groups.
         if self.grid is None or p is None:
+            # Without a list of entries (None), the list is all records, in their order.
             zero = self.backend.UInt32(0)
             return GroupedList(
                 self.records, group_of_blob, None, zero, self.records.iteration_count, count
@@ -500,7 +503,7 @@ def _checked(
         c[order],
         r[order],
         w[order],
-        np.unique(g[order], return_inverse=True)[1],
+        np.unique(g[order], return_inverse=True)[1],  # the groups' numbers from 0 without gaps
     )
 
 

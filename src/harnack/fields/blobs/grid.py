@@ -132,6 +132,7 @@ def _cell_ball_pairs(
             is_inside = (indices >= 0) & (indices < np.array(shape)[:, None])
             squares[~is_inside] = np.inf
             x, y, z = squares[:, 0], squares[:, 1], squares[:, 2]
+            # The squared distances: for each ball, an array over z, y and x.
             square_sums = z[:, :, None, None] + y[:, None, :, None] + x[:, None, None, :]
             ball, k, j, i = np.nonzero(
                 square_sums <= (padded_radii[balls] ** 2)[:, None, None, None]

@@ -287,6 +287,7 @@ class GroupMaximumEnclosure(Enclosure):
                 dr.select(is_above_level, group_fall_length, 0), fall_length
             )
 
+        # Before any group: nothing rises on the whole length, and nothing is kept from falling.
         start = (real(0) + self.length, real(0))
         groups, (rise_length, fall_length) = self.blobs.each_group(
             add_group, start, "steps of groups"

@@ -1,7 +1,8 @@
 """Hermite radial basis functions: a smooth surface through given points p_i, with given normals
 there. The surface is f = 0 for a sum f of one term for each point: f(x) = sum over i of a_i r_i^3 +
 b_i . grad r_i^3, with r_i = |x - p_i|, numbers a_i and vectors b_i. The record of a point is its
-row of numbers (p_i, a_i and 3 b_i). Along a path p + s d, a straight line from a point p, each term
+row of numbers: p_i (entries 0 to 2), what rounding has cut off of p_i (3 to 5), a_i (6) and 3 b_i
+(7 to 9). Along a path p + s d, a straight line from a point p, each term
 is a function of the length s. A path is cut into pieces at knots, which are values of s. Jets are
 intervals that contain the values and the derivatives of a function."""
 
@@ -174,6 +175,7 @@ class HRBF(Formula):
         # computed in the one loop over the points.
         recorder = KnotRecorder()
         length = ahead
+        # (The slope is not needed for this.)
         path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
         # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
@@ -182,6 +184,8 @@ class HRBF(Formula):
         slope = dr.dot(sums.start.gradient, d)
         slopes = SlopeRange.around(slope, sums.start.gradient_error)
         enclosures = path.proofs.from_restriction(sums, slopes, length)
+        # The next sample asks for enclosures up to as many lengths of this step as there are
+        # pieces.
         return RaySample(self._sample(sums.start), enclosures, (), slope, PIECES)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -196,7 +200,8 @@ class HRBF(Formula):
 
         def term(row: list[Real]) -> Jet:
             """The jet of the term a r^3 + b . grad r^3 of one point, which is a r^3 + 3 r (b . v)
-            with v = x - p_i. row: the point's record, whose entries 7 to 9 are 3 b."""
+            with v = x - p_i, whose components are u, v and w in the code. row: the point's record:
+            p_i in two parts (entries 0 to 5), a (6), and 3 b (7 to 9)."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
@@ -211,7 +216,7 @@ class HRBF(Formula):
         def add_point(row: list[Real], state: State) -> State:
             """Return the sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`),
             with the term of one more point added. row: the point's record."""
-            # The vector from the point, its length, and three times the vector of the point.
+            # The vector from the point; three times the vector b_i; the length of v, and 1/length.
             v, b, r, inverse_r = _offset_of_point(p, row)
             b_dot_e = dr.dot(b, v) * inverse_r
             e = v * inverse_r

@@ -231,6 +231,8 @@ class CompactKernel(BlobKernel):
             half_chord_squared * half_chord_squared,
         )
         steepest_x = math.sqrt(0.2) * half_length
+        # Half the chord; the largest |f'| and the largest f'', each as position and size; the
+        # smallest f''.
         return ChordProfile(
             half_length,
             steepest_x,
@@ -324,6 +326,8 @@ class SexticKernel(BlobKernel):
         peak_x = dr.sqrt(fmin(dr.fma(0.6, half_chord_squared, 0.25), half_chord_squared))
         min_first, _ = self.derivatives(height_squared, half_chord_squared, steepest_x)
         _, max_second = self.derivatives(height_squared, half_chord_squared, peak_x)
+        # Half the chord; the largest |f'| and the largest f'', each as position and size; the
+        # smallest f''.
         return ChordProfile(
             dr.sqrt(half_chord_squared),
             steepest_x,
@@ -429,6 +433,8 @@ class CubicKernel(BlobKernel):
         )
         steepest_x = fmin(steepest_x, half_length)
         min_first, _ = self.derivatives(height_squared, half_chord_squared, steepest_x)
+        # Half the chord; the largest |f'| and the largest f'', each as position and size; the
+        # smallest f''.
         return ChordProfile(
             half_length,
             steepest_x,
@@ -531,6 +537,7 @@ class GaussianKernel(BlobKernel):
         multiples of e^b, the kernel's exponential at the center."""
         b = self.sharpness * self.support**2
         exp_b = math.exp(b)
+        # For the kernel, its first and its second derivative.
         return KernelLipschitz(
             4 * b * exp_b, 8 * b * (1 + math.sqrt(b)) * exp_b, 16 * b * (1 + b) * exp_b
         )
@@ -583,6 +590,8 @@ class GaussianKernel(BlobKernel):
             * b
             * (2 * dr.select(is_at_end, z, exp_z * math.exp(-1.5)) + dr.select(is_at_end, 0, 1))
         )
+        # Half the chord; the largest |f'| and the largest f'', each as position and size; the
+        # smallest f''.
         return ChordProfile(
             dr.sqrt(half_chord_squared),
             steepest_x,

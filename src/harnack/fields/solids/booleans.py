@@ -166,6 +166,7 @@ class BooleanSolid(Solid):
             pairs = zip(self.parts, accuracies, strict=True)
             return self._with_parts([part if a is None else a.at(scale) for part, a in pairs])
 
+        # `coarsest` is the accuracy scale of the coarsest samples that a field has.
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
 
     def for_ray_count(self, count: int) -> Field:
@@ -399,9 +400,10 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
 def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
     """A volume that contains the given volumes: a box around them or, if there is only one, that
     volume itself. None if one of them is unbounded."""
-    corners = [volume.bounds() for volume in volumes]
-    lower = np.min([volume for volume, _ in corners], axis=0)
-    upper = np.max([volume for _, volume in corners], axis=0)
+    # `bounds` is a pair of corners, the lowest and the highest.
+    corners = [entry.bounds() for entry in volumes]
+    lower = np.min([entry for entry, _ in corners], axis=0)
+    upper = np.max([entry for _, entry in corners], axis=0)
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
         return None
     if len(volumes) == 1:

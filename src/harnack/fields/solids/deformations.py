@@ -171,8 +171,9 @@ class Twist(Deformation):
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
-        The class docstring has the proof, with the symbols m and a (here `rate`). Without a twist
-        the constant is 1 everywhere."""
+        The constant is (m + sqrt(m^2 + 4))/2, where m is the rate times the largest distance from
+        the axis on the ball (the class docstring has the proof). Without a twist the constant is 1
+        everywhere."""
         # 0 * p.x + number is a Dr.Jit array, with the number in each lane.
         rate = dr.abs(0 * p.x + self.rate)
         axis_distance = _distance_from_axis(p, self.axis)
@@ -251,6 +252,7 @@ class Taper(Deformation):
     def volume(self, volume: Volume | None) -> Volume | None:
         """A box that contains the image of `volume`: the box around a cylinder about the axis,
         whose radius is multiplied by the larger factor. None if `volume` is None or unbounded."""
+        # (radius, ends along the axis)
         cylinder = _cylinder_around(volume, self.axis)
         if cylinder is None:
             return None
@@ -260,7 +262,10 @@ class Taper(Deformation):
 
     def preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of the inverse map on a ball about p, and the radius of that ball.
-        The class docstring has the proof, with the symbols k, m and S (here `total`)."""
+        The square of the constant is (S + sqrt(S^2 - 4 k^2))/2 with S = k^2 + m^2 + 1 (here
+        `total`). k and m bound 1/r and rho |r'|/r^2 on the ball, where r is the factor, r' its
+        derivative along the axis and rho the distance from the axis (the class docstring has the
+        proof)."""
         (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         axis_distance = _distance_from_axis(p, self.axis)
         # Any radius is valid; a larger one has a larger constant.

@@ -204,6 +204,7 @@ class Extrusion(Solid):
         end_distance = dr.abs(p.z - half) - half
         # f, and its derivatives by the two distances.
         value, side_weight, end_weight = _corner(side.value, end_distance)
+        # The derivative of |z - half| by z is the sign of z - half.
         vertical = dr.mulsign(end_weight, p.z - half)
         gradient = gradient * side_weight + cast("Any", type(p))(0, 0, vertical)
         error = side.error + 8 * epsilon * (dr.abs(p.z) + half)
@@ -287,6 +288,7 @@ class Extrusion(Solid):
         point that twist and taper move to a point of the ray), since f has the Lipschitz constant 1
         as a function of the preimage. On lanes where no bound is found, the constant is infinite,
         and holds on the length 0."""
+        # The jets of the preimage's coordinates, as functions of the length from 0 to `length`.
         local = self._preimage(*Jet.along_ray(p, direction, 0.0, length))
         speeds = [0 * p.x + jet.first_derivatives[0].max_abs for jet in local]
         speed = dr.norm(cast("Any", type(p))(*speeds)) * (1 + 1e-5)
@@ -317,8 +319,9 @@ class Extrusion(Solid):
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
             p = cast("Any", type(p))(*taper.preimage(p.x, p.y, p.z))
-        # As in the proof of the class docstring: the constants are multiplied, and the radius is
-        # min(R, S/c), where c is `constant`.
+        # The taper's inverse, with the constant c on the ball of radius R, is followed by that of
+        # the twist, on a ball of radius S. Points within min(R, S/c) of p stay in both balls, and
+        # the two constants are multiplied.
         if twist is not None:
             inner_constant, inner_radius = twist.preimage_lipschitz(p)
             constant, radius = (

@@ -227,6 +227,7 @@ class FractalNoise(FormulaSolid):
         """The same noise with its numbers and bounds as kernel parameters of the backend (numbers
         that a compiled kernel reads when it runs)."""
         prepared = with_device_numbers(self, backend)
+        # `_sum(1.0)` adds up what the octaves multiply a first derivative of the noise by.
         constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
         # `_constants`: bounds of first and second derivatives. `_falls`: the ratio of an octave's
         # amplitude to the one before.
@@ -269,6 +270,7 @@ class FractalNoise(FormulaSolid):
                 axis if isinstance(axis, Jet) else jets[0].coerce(axis) for axis in (x, y, z)
             ]
             return self._ranges(coordinates)
+        # The value of the sum of all octaves, the only entry of the list.
         return self._octaves([x, y, z])[0][0]
 
     def _octaves(self, q: list[Real], *, each: bool = False) -> list[tuple[Any, Any, Any]]:

@@ -153,13 +153,15 @@ class Julia(Solid):
 
             return self.prepare(backend_of(p)).evaluate(p)
         zero = 0 * p.x
+        # With the radius 0 alone; `steepest` is then a bound of |grad f| at p itself.
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
         # No step is longer than this, as the Lipschitz constant on a ball is at least that at its
         # center.
         longest = dr.abs(value) / steepest
+        # Where |f|/|grad f| tells nothing, any length may be tried.
         longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
         radii = tuple(longest * fraction for fraction in _RADIUS_FRACTIONS)
-        constants = self._orbit(p, radii)[3]
+        constants = self._orbit(p, radii)[3]  # the bounds of |grad f|
         promises: list[Lipschitz] = []
         for radius, constant in zip(radii, constants, strict=True):
             is_proved = (constant >= 0) & (constant < dr.inf)

@@ -310,6 +310,7 @@ class _MeshData(UnitFrame):
         if surface.boundary_triangles is not None:
             points = surface.boundary_triangles.reshape(-1, 3)
             indices = np.arange(len(points)).reshape(-1, 3)
+            # Each triangle of the boundary counts once.
             near = _triangle_tree(backend, points, indices, np.ones(len(indices)), slabs=True)
         corners = RecordTable.upload(backend, surface.corners.reshape(-1, 9))
         low, high = (
@@ -403,7 +404,8 @@ class _MeshData(UnitFrame):
         gradient = dr.select(on_face, normal * normal_sign, -closest.offset * (sign / distance))
         # Corners are rounded, which turns a triangle by an angle of about the rounding over its
         # height. The height is twice the area over the longest edge, whose length is of the order
-        # of 1 at most.
+        # of 1 at most. Elsewhere the gradient is a vector over its length: so is its error, which
+        # is at most 2.
         normal_error = 8 * epsilon / double_area
         gradient_error = dr.select(on_face, fmin(normal_error, 2), fmin(2 * error / distance, 2))
         # On a triangle without area nothing is known of the gradient.
@@ -411,7 +413,7 @@ class _MeshData(UnitFrame):
         return Sample(
             sign * distance * self.size,
             gradient,
-            (Lipschitz(0 * p.x + 1),),
+            (Lipschitz(0 * p.x + 1),),  # the constant 1, on each lane
             error * self.size,
             gradient_error,
         )
@@ -758,9 +760,10 @@ def _check_closed(vertices: FloatArray, welded: Welded) -> None:
     face_edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, count = np.unique(face_edges, axis=0, return_counts=True)
     # Find each edge of `edges` among all edges of faces. An edge with the vertices a < b has the
-    # key a n + b, with n the number of vertices; `pairs` is sorted by this key.
-    key = len(vertices)
-    indices = np.searchsorted(pairs @ [key, 1], np.sort(edges, axis=1) @ [key, 1])
+    # key a n + b, with n the number of vertices; `pairs` is sorted by this key. (The matrix product
+    # with [n, 1] computes it.)
+    vertex_count = len(vertices)
+    indices = np.searchsorted(pairs @ [vertex_count, 1], np.sort(edges, axis=1) @ [vertex_count, 1])
     is_open = (count[indices] == 1) & (edge_weights == 1)
     # Open edges are reported first.
     bad_edges = edges[is_open] if is_open.any() else edges

@@ -112,6 +112,7 @@ class OutlineEdges:
         # For each edge the number of its loop, so that no chain joins two loops.
         loop = np.repeat(np.arange(len(outline)), [len(array) for array in outline])
         if axis:
+            # Coordinates count from the center, so that the axis is the line x = -center[0].
             keep = (start[:, 0] != -center[0]) | (end[:, 0] != -center[0])
             # Another chain begins behind an edge that is left out.
             loop = loop + np.cumsum(~keep)
@@ -165,7 +166,9 @@ class OutlineEdges:
             x, y, velocity, knots, _VECTOR_ROUNDINGS * epsilon * (size + self.size), epsilon
         )
         zero = 0 * x
-        # The state before any edge, in the order that `_OutlineQuery` describes.
+        # The state before any edge: the distance from the nearest edge, its error, the vector from
+        # its nearest point, its normal, and two masks: whether that point is inside the edge, and
+        # whether the query point is inside. (zero > 1 is False on each lane.)
         start = zero + dr.inf, zero, zero, zero, zero, zero, zero > 1, zero > 1
         state = (*start, *(zero + dr.inf for _ in knots))
         if self.chains is None:
@@ -219,6 +222,7 @@ class OutlineEdges:
             # A near chain has `count` edges to visit. A far one has 0, and its box is already in
             # the state.
             count, state = query.with_chain(record, max_distance, state)
+            # Entry 6 of the record is the index of its first edge.
             first_edge, count = type(i)(record[6]), type(i)(count)
 
             def each(j: Any, *edge_state: Any) -> tuple[Any, ...]:
@@ -228,6 +232,7 @@ class OutlineEdges:
             def has_more(j: Any, *_: Any) -> Mask:
                 return j < count
 
+            # The state of the inner loop, without its index.
             return i + 1, *dr.while_loop((type(i)(0), *state), has_more, each, label="outline")[1:]
 
         def has_more_chains(i: Any, *_: Any) -> Mask:
@@ -314,7 +319,8 @@ class _OutlineQuery:
         within which some chain must have a point. The result is the smaller of the state and that
         square for one more chain.
 
-        row: the record of the chain, which begins with its box.
+        row: the record of the chain, which begins with its box: lowest x, lowest y, highest x,
+            highest y.
         """
         (min_square,) = state
         near_x, far_x = self._distances_from_ends(self.x, row[0], row[2])
@@ -340,7 +346,8 @@ class _OutlineQuery:
         must be visited, and the state stays. If it is farther away, the number is 0, and the box is
         added to the state in place of the edges.
 
-        row: the record of the chain.
+        row: the record of the chain: its box (lowest x, lowest y, highest x, highest y), y of its
+            first and of its last vertex, the index of its first edge, and the number of its edges.
         limit: a distance within which the nearest edge lies.
         state: the state of the loop before, whose members the class docstring lists.
         """

@@ -43,17 +43,18 @@ def box_around(half: tuple[float, float, float], center: Any = (0.0, 0.0, 0.0)) 
     half: (3,) half of the length of the side along each axis.
     center: (3,).
     """
-    sizes = [
+    half_sides = [
         max(h, 0.0) + _EXTENT_MARGIN * (abs(h) + abs(c)) for h, c in zip(half, center, strict=True)
     ]
-    lower = [c - s for c, s in zip(center, sizes, strict=True)]
-    upper = [c + s for c, s in zip(center, sizes, strict=True)]
+    lower = [c - s for c, s in zip(center, half_sides, strict=True)]
+    upper = [c + s for c, s in zip(center, half_sides, strict=True)]
     return Box((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2]))
 
 
 def ball_around(center: tuple[float, float, float], radius: float) -> Volume:
     """The ball around a center, enlarged by `_EXTENT_MARGIN` for rounding. A negative radius counts
     as 0."""
+    # The 1e-30 keeps the radius above 0, as a ball needs it.
     slack = _EXTENT_MARGIN * (abs(radius) + sum(abs(c) for c in center)) + 1e-30
     return Ball(center, max(radius, 0.0) + slack)
 

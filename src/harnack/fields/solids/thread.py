@@ -165,7 +165,7 @@ class Thread(Solid):
         sign = dr.select(is_outside, real(1), real(-1))
         distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
-        # Where d < -m/2, in the symbols of the class docstring, f is -m/2; `_least` is m/2.
+        # f is at least -m/2, where m is the smallest radius of the profile; `_least` is m/2.
         is_core = value <= -data._least
         value = dr.select(is_core, -data._least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
@@ -200,6 +200,8 @@ class Thread(Solid):
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
         numbers = cast("Any", self)
+        # In this order: f, its error, r = |(x, y)|, half the derivative of r^2 along the ray, the
+        # squared length of (d.x, d.y), the radius of the cylinder, the Lipschitz constant.
         cylinder = OutsideCylinderEnclosure(
             ray_sample.sample.value, ray_sample.sample.value_error,
             dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)), dr.fma(p.x, d.x, p.y * d.y),
@@ -393,6 +395,7 @@ def metric_thread(
     # The lengths along the axis of the flat crest, of a flank, and of the flat root.
     flat, flank, bottom = pitch / 8 + 2 * shift, 5 * pitch / 16, pitch / 4 - 2 * shift
     z = np.cumsum([-shift, flat, flank, bottom])
+    # With a single start.
     thread = Thread(np.column_stack([z, [crest, crest, root, root]]), pitch, 1, left_handed)
     outer = crest + 0.25 * depth  # beyond the crests, so that no faces coincide
     bevel = outer - root

@@ -72,6 +72,7 @@ class AffineMap(SpaceMap, Parametrized):
                 f"the matrix is singular (singular values {sizes[0]:g} to {sizes[-1]:g}): it would "
                 "flatten the solid"
             )
+        # Functions of solids are multiplied by the factor of lengths; by 1 if there is none.
         rows = tuple(tuple(float(number) for number in row) for row in m)
         return cls(rows, tuple(float(number) for number in b), _length_factor(m) or 1.0)
 
@@ -300,6 +301,7 @@ class TransformedSolid(SolidOfField):
         # The gradient of the inner solid need not be the middle of its range
         # (`Formula._with_one_sided_gradient`). So the half widths of the ranges are added to its
         # error.
+        # p.x tells `hessian_error` the type of the result.
         return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
@@ -335,6 +337,7 @@ class TransformedSolid(SolidOfField):
             if ray_sample.slope_error is None
             else ray_sample.slope_error * speed * numbers.factor
         )
+        # `reach_growth` is a ratio of lengths, which the map does not change.
         return RaySample(sample, forward, backward, slope, ray_sample.reach_growth, error)
 
     def _term_bound(self, p: Vec3, t: Real) -> Real:
@@ -342,6 +345,8 @@ class TransformedSolid(SolidOfField):
         preimage of p + t d, for any unit direction d. The rounding error of the preimage is
         proportional to it."""
         numbers = self.numbers
+        # By Cauchy-Schwarz: no row of M^-1 is longer than the stretch, and a vector is at most
+        # sqrt(3) times as long as its largest component.
         return numbers.stretch * (max_norm(p) + numbers.offset_size + t) * math.sqrt(3)
 
     def _image_sample(self, sample: Sample, term_bound: Real) -> Sample:
@@ -401,6 +406,7 @@ class _InverseMap:
     def of(cls, change: AffineMap) -> _InverseMap:
         """The inverse of the affine map `change`, in Python numbers."""
         inverse = change.inverse
+        # The first singular value is the largest.
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
         return cls(
             tuple(tuple(float(number) for number in row) for row in inverse),

@@ -240,6 +240,7 @@ class Tube(Solid):
         # The last vertex of a polyline is not joined to the first of the next.
         is_segment[[vertex - 1 for vertex in self.starts]] = False
         start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
+        # A record: the start, the vector to the end, and 1 / length^2.
         rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
         groups = None
         if len(rows) >= _MIN_SEGMENTS_FOR_GROUPS:
@@ -272,6 +273,7 @@ class Tube(Solid):
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
         if not hasattr(self, "_records"):
+            # The last argument, `back`, is not used.
             return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
         # If `ahead` is infinite, the inner knots are fractions of another length.
         endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
@@ -281,6 +283,7 @@ class Tube(Solid):
         slope = dr.dot(sample.gradient, path.direction)
         # A distance grows no faster than the length.
         max_slope = fmin(slope + sample.gradient_error, 1.0)
+        # 4.0: the next sample asks for enclosures up to four times the length of this step.
         return RaySample(
             sample, (TangentEnclosure(distance, max_slope, knots, bounds),), (), slope, 4.0
         )
@@ -679,6 +682,9 @@ class _Segment(Field):
         Lipschitz constant 1, and a bound of second derivatives on a ball."""
         backend, row = self._boxes.backend, self._row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
+        # The record: the start of the segment (0 to 2), the radius (3), the vector from the start
+        # to the end (4 to 6), and 1 / length^2 (7). Positions are relative to the center of the
+        # boxes.
         from_start = vector(p) - self._boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
         # The position of the segment's point nearest to p, as a fraction of the segment; and the
@@ -694,7 +700,8 @@ class _Segment(Field):
         gradient = dr.select(distance > 0, away / distance, vector(0))
         # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, dr.minimum(4 * error / distance, 2), 2)
-        # s = D/2 of the proof, from the smallest possible distance; the bound is 1/s.
+        # The distance D is convex with second derivatives of at most 1/D. So on the ball of radius
+        # D/2 they are at most 2/D, one over that radius. D is taken as the smallest possible one.
         taylor_radius = _TAYLOR_RADIUS * fmax(distance - error, 0)
         promises: tuple[Promise, ...] = (
             Lipschitz(backend.Float(1)),
