@@ -311,3 +311,12 @@ def test_each_result_of_a_trace_has_its_derivative_or_refuses_it(
     dr.forward(array)
     assert np.isnan(np.array(hits.normal.grad)).all()
     assert np.isfinite(np.array(hits.t.grad)).all()
+
+
+def test_the_check_of_a_mesh_refuses_vertices_with_derivatives() -> None:
+    """They were dropped without a word by functions that check a mesh before anything else."""
+    x: Any = choose_backend("double").Float(0.5)
+    dr.enable_grad(x)
+    vertices = [[x, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    with pytest.raises(NotImplementedError, match="the vertices cannot be differentiated"):
+        geometry.validate_mesh(vertices, [[0, 1, 2]])

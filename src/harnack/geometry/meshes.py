@@ -17,6 +17,7 @@ from harnack.backend.validation import (
     IntArray,
     check_coordinate_size,
     check_finite,
+    check_no_derivatives,
     check_vectors,
     format_vector,
     others_suffix,
@@ -197,7 +198,9 @@ def _as_array(values: Any, name: str, ragged: str) -> npt.NDArray[Any]:
 
     Raises:
         MeshError: they are no array of numbers.
+        NotImplementedError: they carry derivatives, which would be lost.
     """
+    check_no_derivatives(name, values)
     try:
         array = np.asarray(values)
     except (ValueError, OverflowError):
