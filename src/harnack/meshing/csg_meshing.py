@@ -186,6 +186,7 @@ class CsgMesher:
         Raises:
             MeshingError: the solid or one of its operands cannot be meshed.
         """
+        # A method returns None for a solid that is to be meshed as a level set.
         for kind, method in self.methods.items():
             manifold = method(self, solid, level) if isinstance(solid, kind) else None
             if manifold is not None:
@@ -359,8 +360,8 @@ class CsgMesher:
         angle it lies between two level sets with a common boundary curve.
 
         Raises:
-            MeshingError: the wall is thinner than the tolerance, or its field has a period and is
-                no solid angle.
+            MeshingError: g is the function of a plain field, no solid, and the wall is thinner than
+                twice the tolerance; or g has a period and is no solid angle.
         """
         from manifold3d import Manifold
 
@@ -371,6 +372,8 @@ class CsgMesher:
         field = wall.field
         if field.period is None:
             inside = SublevelSolid(field)
+            # The estimate of the thickness is for plain fields. A wall about the surface of a solid
+            # is only checked as every mesh is, after its parts were put together.
             if not isinstance(field, Solid):
                 self._check_wall_thickness(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
@@ -450,6 +453,7 @@ class CsgMesher:
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
+        # If all lengths of merging fail, `surface` stays the unmerged mesh.
         for fraction in _MERGED_WITHIN:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _SPLITS)
@@ -751,8 +755,9 @@ def mesh_solid(
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = CallCache()
-    first: MeshingError | None = None
-    before: MeshingError | None = None
+    # The errors of the first attempt, and of the one before the current attempt.
+    first_failure: MeshingError | None = None
+    previous_failure: MeshingError | None = None
     while True:
         mesher = CsgMesher(
             lower, upper, max_error, cell_size, per_wave, angle_mesher(max_error, cell_size),
@@ -764,14 +769,18 @@ def mesh_solid(
             surface = _check_and_mend(mesher, solid, level, surface, size, check)
             break
         except TriangleLimitError as too_large:
-            if first is None:
+            if first_failure is None:
                 raise
-            raise first from too_large  # the first error is the cause
+            # It was the first error that led to so small cells.
+            raise first_failure from too_large
         except (MissedPartsError, LocalizedMeshingError) as failure:
-            attempts, first = attempts - 1, first or failure
-            if not attempts or not is_retry_promising(failure, before, CELL_SIZE_RATIO**attempts):
+            attempts, first_failure = attempts - 1, first_failure or failure
+            # Give up after the last attempt, or if even the smallest cells to come would not help.
+            if not attempts or not is_retry_promising(
+                failure, previous_failure, CELL_SIZE_RATIO**attempts
+            ):
                 raise
-            before = failure
+            previous_failure = failure
             cell_size *= CELL_SIZE_RATIO
             # More cells along a wave in proportion, as these may limit the size of cells.
             per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)

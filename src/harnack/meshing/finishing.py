@@ -126,7 +126,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
                 "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
-    # The function is larger inside.
+    # Faces look to where the function is larger. If that is inside, they are turned over.
     elif not len(boundary) and mesh.volume < 0:
         mesh.invert()
     mesh.metadata["harnack"] = {

@@ -156,7 +156,8 @@ class IntendedSolid:
             faces = joined
         # Faces that still have three different corners.
         rows = np.flatnonzero(has_distinct_corners(joined))
-        # Every face has its reverse: keep one of both.
+        # No faces are left (`net`) if equal faces are added and opposite ones cancel, so every face
+        # has its reverse: keep one of both.
         if not len(welded.net.faces):
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
         joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
@@ -251,6 +252,7 @@ class IntendedSolid:
         are farther than `away` from the surface."""
         points, w = self.samples
         corner = surface.vertices[surface.faces]
+        # (Another seed than that of `samples`.)
         near_surface = _near(corner, self.size, np.random.default_rng(1))
         points, w = (
             np.concatenate([points, near_surface]),
@@ -278,7 +280,7 @@ class IntendedSolid:
         are compared only for a closed mesh that winds around no point twice or clockwise; for other
         meshes the result is None."""
         _, w = self.samples
-        # Edges that do not cancel: the mesh is not closed.
+        # No field: there are no faces. Singular edges, which do not cancel: the mesh is not closed.
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
         if (w > 1.5).any() or (w < -0.5).any():

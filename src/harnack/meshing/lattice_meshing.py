@@ -704,7 +704,8 @@ def _sample_lattice(
             everywhere.
     """
     count = len(points)
-    # The values of points that are not evaluated: far above the level.
+    # The values of points that are not evaluated: far above the level. (From `OUTSIDE_VALUE` on, a
+    # value stands for the outside, and edges that end there are cut in the middle.)
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))

@@ -358,6 +358,7 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     """
     is_on = points.is_on_level[tets.corners]
     rows = np.arange(len(is_on))
+    # (`argmin` finds the first False.)
     first_free_corner = np.argmin(is_on, axis=1)
     side = np.zeros(is_on.shape, np.int64)
 

@@ -394,6 +394,7 @@ def _best_places(
             best[is_better], best_angle[is_better] = x[is_better], angle[is_better]
     # Only the best position is moved onto the level set. That changes it little, since the targets
     # are near the level set.
+    # (1e-300 keeps it above 0.)
     span = row_norms(best - start) + 1e-300
     best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)

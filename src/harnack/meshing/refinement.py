@@ -533,7 +533,8 @@ def smooth(
                 )
         target = 0.5 * (vertices + neighbor_sum / neighbor_count[:, None])
         target_samples = function.sample(target[free_rows])
-        # Newton's steps are limited to twice the move: beside the boundary, gradients turn.
+        # Newton's steps are limited to twice the move: beside the boundary, gradients turn. (1e-300
+        # keeps the limit above 0.)
         move_length = row_norms(target[free_rows] - vertices[free_rows]) + 1e-300
         moved = vertices.copy()
         moved[free_rows] = newton_to_level(

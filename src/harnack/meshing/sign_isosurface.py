@@ -583,7 +583,8 @@ class _CreaseRefinement:
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
-        # Faces whose three new vertices all lie on creases; then those that get an inner vertex.
+        # Faces whose three new vertices all lie on creases; then those that get an inner vertex. (0
+        # in place of -1: the first condition has excluded these faces.)
         fan_rows = np.flatnonzero(
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)

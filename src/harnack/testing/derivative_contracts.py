@@ -102,6 +102,7 @@ def _spacing_within(
     is_inside = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, is_inside
+    # At most 24 halvings: a point that is so near to the border has no spacing.
     for _ in range(24):
         is_inside[:] = True
         # The domain is convex, so it is enough to test the outermost nodes.

@@ -100,6 +100,7 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     p0, p1 = np.ones_like(s), s
     d0, d1 = np.zeros_like(s), np.ones_like(s)
     for degree in range(1, _TERMS + 1):
+        # c is the coefficient of q^degree.
         power = power * q
         k = 2 * degree + 1
         if dimension == 2:

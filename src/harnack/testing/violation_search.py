@@ -367,6 +367,7 @@ def search_violations(
         # Keep the best move of each pair if it is better than the pair itself.
         best, is_better = best.best_of(search.pairs(p + reach * point_shift, new_w))
         steps = np.where(is_better, np.minimum(_STEP_GROWTH * steps, 1), _STEP_SHRINKAGE * steps)
+        # A search whose steps have become tiny begins anew with large ones.
         steps = np.where(steps < _MIN_STEP, _FIRST_STEP, steps)
     is_violated = best.violation_ratio > 1 + _RATIO_TOLERANCE
     if is_violated.any():
