@@ -142,7 +142,8 @@ class CsgMesher:
     """Meshes solids and their Boolean combinations in the box from `lower` to `upper`, (3,) each.
     It goes down the tree of operands, meshes the level set of each leaf in a lattice of cells, and
     combines the results. The attributes from `evaluations` to `smallest_cell` count what was done
-    so far.
+    so far. `intersected_with` are solids with which the meshed one will be intersected, so that
+    nothing need be meshed where one of them has no points.
 
     tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
         surface.
@@ -246,7 +247,8 @@ class CsgMesher:
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
-                # Inside of a complement only these operands count: the second part of the proof.
+                # Inside of a complement only these operands count, and none of the operations
+                # around this one (the second part of the proof at `IntersectedOperands`).
                 self.intersected_with = tuple(
                     (operand, level) for operand in others if _is_complement_free(operand)
                 )
@@ -456,6 +458,7 @@ class CsgMesher:
         # If all lengths of merging fail, `surface` stays the unmerged mesh.
         for fraction in _MERGED_WITHIN:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
+            # Triangles across creases are cut, in at most `_SPLITS` rounds.
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _SPLITS)
             try:
                 surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)

@@ -112,8 +112,9 @@ class Difference:
 @dataclass(frozen=True)
 class IntendedSolid:
     """The solid that a damaged mesh is meant to bound: the mesh with equal corners joined, and with
-    faces turned over so that it is not inside out. A closed part of it is a connected group of
-    faces that run every edge as often in one direction as in the other.
+    faces turned over so that it is not inside out (the faces `oriented`). A closed part of it (one
+    of `parts`) is a connected group of faces that run every edge as often in one direction as in
+    the other.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     is_turned: (m,) mask of the faces whose orientation was reversed.

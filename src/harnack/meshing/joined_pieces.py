@@ -111,10 +111,9 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 @dataclass(frozen=True)
 class _Cut:
     """Some faces of a mesh, cut along each other into triangles ("pieces"), and the winding numbers
-    of the whole mesh on both sides of each piece.
-
-    Lengths are scaled so that coordinates are at most about one: center + size * x is the original
-    position of x.
+    of the whole mesh on both sides of each piece, `front` and `back`; its normal points to the
+    front. Lengths are scaled so that coordinates are at most about one: center + size * x is the
+    original position of x. `unit` are the scaled vertices of the mesh.
 
     tree: of the faces that were cut.
     unit: (n, 3) the vertices of the mesh, scaled.
@@ -218,8 +217,8 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         if not is_cut.any():
             break
         count = len(x)
-        # Find the sides of faces that are edges to be cut; a face is cut at one side in a round. The
-        # key of an edge between vertices a < b is a * count + b.
+        # Find the sides of faces that are edges to be cut; a face is cut at one side in a round.
+        # The key of an edge between vertices a < b is a * count + b.
         keys = edges[is_cut] @ [count, 1]
         face_keys = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
         position = np.searchsorted(keys, face_keys).clip(max=len(keys) - 1)
@@ -260,6 +259,7 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     direction = (q - p)[edge_row] / np.maximum(2 * half_length[edge_row], 1e-300)[:, None]
     relative = x[candidate] - p[edge_row]
     position = row_dots(relative, direction)
+    # On the line of the edge up to rounding (`_SAME`), and strictly between its ends.
     is_on = row_norms(relative - position[:, None] * direction) <= _SAME
     is_on &= (candidate != edges[edge_row, 0]) & (candidate != edges[edge_row, 1])
     is_on &= (position > 0) & (position < 2 * half_length[edge_row])

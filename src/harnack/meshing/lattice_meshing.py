@@ -98,7 +98,8 @@ _FLAT_RADIUS = 0.25
 
 class MissedPartsError(MeshingError):
     """The error for a level set with parts that the mesh misses, because they pass between the
-    points of the lattice, as a wall thinner than a cell does.
+    points of the lattice, as a wall thinner than a cell does. `places` are points of the longest
+    missed part, `thickness` is how thick it is at each of them, and `size` is the size of a cell.
 
     places: (k, 3) points on the level set, in the longest missed part.
     thickness: (k,) thicknesses of the part at these points, lengths: 2^-7, 2^-6, ..., 1 cells; 0 if

@@ -276,8 +276,8 @@ class _WorkingMesh:
         filling = fill_holes(
             self.vertices, self.faces, loops, lambda p: field.value(p, precision="double")
         )
-        # New faces come from no face of the input (-1), and are not turned. `counts` stays, since no
-        # face was removed.
+        # New faces come from no face of the input (-1), and are not turned. `counts` stays, since
+        # no face was removed.
         new_count = len(filling.faces)
         filled_mesh = _WorkingMesh(
             np.concatenate([self.vertices, filling.vertices]),

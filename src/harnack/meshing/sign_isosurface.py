@@ -559,14 +559,16 @@ class _CreaseRefinement:
         a, b = x[ends[:, 0]], x[ends[:, 1]]
         fraction, to_line, sine2 = _toward_tangent_planes(a, b, one, other)
         edge_length = row_norms(b - a)
-        # Of these, the edges that are far from the line between the tangent planes.
+        # Of these, the edges that are far from the line in which the tangent planes meet; neither
+        # nearly parallel planes nor short edges.
         is_far = (
             (sine2 > _MIN_SQUARE)
             & (row_norms(to_line) > tolerance)
             & (edge_length > _SHORTEST * tolerance)
         )
         rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
-        # Of these, the edges beside which the level set is found.
+        # Of these, the edges beside which the level set is found, on segments at most `_OFFSET`
+        # times as long as the edge.
         foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
         points, new_normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
         rows, points, new_normal, fraction = (
@@ -601,6 +603,8 @@ class _CreaseRefinement:
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
         """Split the edges and faces of the mesh `x` (n, 3), `faces` (m, 3). Returns the vertices of
         the finer mesh, the given ones first, and its faces."""
+        # `rows` and `corner_faces` are the faces that get an inner vertex; these come last in
+        # `points`.
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
         is_without_inner = np.ones(len(faces), np.bool_)

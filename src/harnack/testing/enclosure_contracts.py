@@ -79,6 +79,7 @@ class PromiseCase:
         promise: Any = self.promise
         # Without the allowance for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
+            # How far the range goes below and above f(p) = 0.
             ends = -promise.lower, promise.upper
             below, above = (None if _is_infinite(end) else end for end in ends)
             if not kind.applies_to(promise.dimension, below is not None, above is not None):

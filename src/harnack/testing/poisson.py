@@ -169,6 +169,7 @@ class AxialFunctions:
         total = np.zeros_like(q)
         for j in range(self.latitudes_or_heights.shape[1]):
             position, weight = self.latitudes_or_heights[:, j, None], self.weights[:, j, None]
+            # "points": rings of mass. Otherwise caps.
             function = kernel_difference if self.measure == "points" else cap_movement
             total += weight * function(q, position, self.dimension)
         return total
@@ -205,7 +206,7 @@ class GreenPotentials:
             outside = distance > size
             value = np.where(outside, size**3 / (3 * distance), 0.5 * size**2 - y * y / 6)
             slope = np.where(outside, size**3 * y / (3 * distance**3), y / 3)
-        # Subtract the potential of the image.
+        # Subtract the potential of the ball's image in the unit sphere, so that it is 0 there.
         value, slope = value - size**3 / 3, slope - size**3 * y / 3
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 

@@ -272,8 +272,9 @@ _DIFFERENCE_SPACING = 1e-3
 @dataclass(frozen=True)
 class _Candidates:
     """Pairs of points (p, y) at which a promise is tested: p is the point where the promise is
-    made, a bound of f on a ball about p; y is a point of the ball. The violation ratio of a pair is
-    the change of f from p to y relative to its bound; above 1 the promise is violated.
+    made, a bound of f on a ball about p; y = p + reach * w is a point of the ball, with the ball's
+    radius `reach` and |w| < 1. The violation ratio of a pair is the change of f from p to y
+    relative to its bound; above 1 the promise is violated.
 
     p: (n, 3) the first points.
     w: (n, 3) the second points are y = p + reach * w, with |w| < 1.
