@@ -177,7 +177,8 @@ class _FaceBoxTree:
 @dataclass(frozen=True)
 class _PairTests:
     """Tests of pairs of faces, on the device: they prove that the two faces have nothing in common
-    but shared vertices.
+    but shared vertices. `points` is a table of the vertices, and `corners` are the indices of the
+    first, second and third vertices of all faces.
 
     points: the record table of the vertices.
     corners: three index arrays on the device: the first, second and third vertices of all faces.

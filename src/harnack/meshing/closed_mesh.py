@@ -287,8 +287,8 @@ def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
     from manifold3d import Manifold
 
     r = ball.radius
-    # A side of the octahedron becomes segments/4 edges, so each of its 8 faces becomes (segments/4)^2
-    # faces.
+    # A side of the octahedron becomes segments/4 edges, so each of its 8 faces becomes
+    # (segments/4)^2 faces.
     # From (2 pi r/n)^2/(2 r) <= tolerance, rounded up to a multiple of 4.
     segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
     if segments > _MAX_SEGMENTS:

@@ -147,5 +147,6 @@ def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
     edges: the `Edges` of the `half_edges` of the surface's faces.
     """
     normals = unit_normals(surface.vertices[surface.faces])
+    # Half edge h is one of face h % m.
     pairs = edges.paired_half_edges() % len(surface.faces)
     return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())

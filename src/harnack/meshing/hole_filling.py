@@ -715,6 +715,7 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     count: the number of vertices.
     """
     edges = Edges.of(half_edges(new))
+    # Half edge h is one of face h % len(new).
     part = connected_groups(edges.paired_half_edges() % len(new), len(new))
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)

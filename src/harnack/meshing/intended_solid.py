@@ -66,7 +66,8 @@ _OPEN_SHARE = 0.4
 class Difference:
     """How the closed surface that a repair returned differs from the input mesh. A compared point
     is on the wrong side if the input's winding number tells clearly that it should be inside and it
-    is outside of the surface, or the reverse.
+    is outside of the surface, or the reverse. `share` is the fraction of such points, and `missing`
+    and `added` are how many there are of the first and of the second kind.
 
     share: the fraction of the compared points that are on the wrong side.
     places: (k, 3) some of these points.

@@ -111,9 +111,9 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 @dataclass(frozen=True)
 class _Cut:
     """Some faces of a mesh, cut along each other into triangles ("pieces"), and the winding numbers
-    of the whole mesh on both sides of each piece, `front` and `back`; its normal points to the
-    front. Lengths are scaled so that coordinates are at most about one: center + size * x is the
-    original position of x. `unit` are the scaled vertices of the mesh.
+    of the whole mesh on both sides of each piece, `front` and `back`; the normal of a piece points
+    to its front. Lengths are scaled so that coordinates are at most about one: center + size * x is
+    the original position of x. `unit` are the scaled vertices of the mesh.
 
     tree: of the faces that were cut.
     unit: (n, 3) the vertices of the mesh, scaled.

@@ -778,6 +778,7 @@ def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     rounding: the normals of both are opposite. A pair of neighbors is tested if the mask `among`
     (m,) is set for at least one of the two."""
     normal = unit_normals(x[faces])
+    # Half edge h is one of face h % len(faces).
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
     is_folded = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])

@@ -178,8 +178,8 @@ class AxialFunctions:
 @dataclass(frozen=True)
 class GreenPotentials:
     """Potentials of balls of constant density inside of the unit ball of R^3, evaluated on an axis
-    through the centers of all balls; several balls per row. The potentials vanish on the unit
-    sphere.
+    through the centers of all balls; several balls per row. `centers` are their positions on the
+    axis, `sizes` their radii. The potentials vanish on the unit sphere.
 
     centers, sizes: (rows, k) the positions of the balls on the axis, and their radii; |center| +
         size <= 1.

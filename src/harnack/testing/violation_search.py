@@ -385,7 +385,8 @@ def search_violations(
 class _ViolationSearch:
     """The search for pairs of points (p, y) that violate a promise: a bound of f that the field
     states, at each point p, for a ball about p; y is a point of the ball. The violation ratio of a
-    pair is the change of f from p to y relative to its bound.
+    pair is the change of f from p to y relative to its bound. The length `longest` takes the place
+    of an infinite radius.
 
     field: the field.
     promise_index: the index of the promise in `Sample.all_promises`.
