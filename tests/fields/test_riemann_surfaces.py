@@ -19,6 +19,7 @@ from harnack.enclosures.extremum import BranchPointEnclosure, BranchSample, Near
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_type
 from harnack.fields.analytic.plane import make_branches
 from harnack.testing import BrokenPromiseError, check_field
+from harnack.testing.branch_contracts import check_branch_points
 from tests.backend.test_kernels import compiled
 
 Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -215,6 +216,21 @@ def test_a_branch_point_whose_constant_is_too_small_is_found() -> None:
     )
     with pytest.raises(BrokenPromiseError, match=r"constant must be at least (1|0.9999)"):
         check_field(wrong, count=20)
+
+
+def test_a_branch_that_is_no_number_near_a_branch_point_is_found() -> None:
+    """Only the other branch was compared there."""
+
+    def with_nan(z: Any) -> Any:
+        (w, slope), other = root(z)
+        return [(w * dr.select(abs(z) > 1e-3, 1 + 0 * abs(z), dr.nan), slope), other]
+
+    point = hk.fields.BranchPoint(0, 0.5, 1.0)
+    wrong = hk.fields.RiemannSurface(
+        with_nan, singular_points=[point], second_bound=lambda z, r: 0.25 * (abs(z) - r) ** -1.5
+    )
+    with pytest.raises(BrokenPromiseError, match="a branch is farther from the value"):
+        check_branch_points(wrong, 1.0, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.001])

@@ -11,6 +11,8 @@ import trimesh
 
 import harnack as hk
 from harnack.geometry import example_meshes
+from harnack.meshing.closed_mesh import volume_manifold
+from harnack.meshing.meshing_errors import MeshingError
 from tests.fields.test_shapes import CROSSING, UNITED
 
 CUBE = trimesh.creation.box((2.0, 2.0, 2.0))
@@ -84,3 +86,10 @@ def test_shells_are_as_thick_as_asked() -> None:
     grown = hk.mesh(hk.solid(CUBE).offset(0.2), tolerance=2.4e-2)
     exact = 8 + 0.2 * 24 + math.pi * 0.04 * 6 + 4 / 3 * math.pi * 0.008
     assert grown.volume == pytest.approx(exact, rel=1e-2)
+
+
+def test_a_ball_of_too_many_faces_is_refused_with_their_number() -> None:
+    """Its polyhedron has 44,432 segments around: 8 (44432/4)^2 faces."""
+    ball, corner = hk.Ball(radius=1.0), np.full(3, 2.0)
+    with pytest.raises(MeshingError, match="has 987,101,312 faces"):
+        volume_manifold(ball, -corner, corner, 1e-8)

@@ -23,6 +23,7 @@ from harnack.meshing.harmonic_filling import (
     triangle_fills,
 )
 from harnack.meshing.hole_filling import hole_loops
+from harnack.meshing.mesh_cleaning import clean_and_fill
 from harnack.meshing.mesh_tolerance import MeshTolerance
 from tests.oracles.mesh_files import read_closed
 from tests.oracles.triangle_pairs import intersecting_pairs
@@ -268,6 +269,18 @@ def test_flipped_and_doubled_faces_are_all_told() -> None:
     facts = made.metadata["harnack"]
     assert (facts["turned"], facts["patches"], facts["left_out"]["doubled"]) == (128, 0, 128)
     assert corners(made) == corners(trimesh.Trimesh(vertices, faces, process=False))
+
+
+def test_fillings_come_last_also_behind_many_duplicates() -> None:
+    """A ball of 79 triangles with a hole, the first of them 300 times more: the others have
+    indices above the number of vertices and triangles that are left."""
+    vertices, faces = icosphere(1)
+    given = np.concatenate([np.repeat(faces[:1], 300, axis=0), faces[:-1]])
+    cleaned = clean_and_fill(vertices, given, lambda message: None)
+    assert cleaned.left_out["doubled"] == 300
+    assert cleaned.kept_faces.tolist() == [0, *range(301, 379)]
+    kept = cleaned.surface.vertices[cleaned.surface.faces[:79]]
+    assert (kept == vertices[given[cleaned.kept_faces]]).all()
 
 
 @pytest.mark.slow

@@ -230,6 +230,7 @@ class Polytope(Volume):
             t0 = dr.select(is_leaving | (room >= 0), t0, fmax(dr.abs(t), t0))
             return t0, t1
 
+        # Zeros, which give the interval's ends as many lanes as the widest argument has.
         lanes = dr.zeros(backend.Float, dr.width(o, d, t_min, t_max))
 
         def is_nonempty(t0: Real, t1: Real) -> Mask:
@@ -278,6 +279,7 @@ class Polytope(Volume):
             return dr.select(is_larger, distance, state[0]), dr.select(is_larger, n, state[1])
 
         width = dr.width(p)
+        # The first plane replaces both: a distance of -inf, and any normal.
         start = (
             dr.full(backend.Float, -dr.inf, width),
             backend.Array3f(0, 0, 1) + dr.zeros(backend.Array3f, width),
@@ -471,9 +473,8 @@ class HalfSpace(Polytope):
         axis."""
         lower, upper = np.full(3, -np.inf), np.full(3, np.inf)
         for k, n in enumerate(self.normal):
-            if n and not any(
-                np.delete(self.normal, k)
-            ):  # only a plane normal to an axis bounds the box
+            # Only a plane at right angles to an axis bounds the box.
+            if n and not any(np.delete(self.normal, k)):
                 (upper if n > 0 else lower)[k] = n * self.offset
         return lower, upper
 

@@ -128,7 +128,8 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
 @dataclass(frozen=True)
 class Edges:
     """The distinct edges among n pairs of indices of points. A pair (a, b) and its reverse (b, a)
-    are the same edge.
+    are the same edge. `edge_of_pair` is the index of each pair's edge, and `multiplicity` the
+    number of pairs that an edge is.
 
     vertices: (k, 2) the two ends of each of the k edges, the lower index first, in lexicographic
         order.

@@ -237,7 +237,8 @@ def _resolve_crossings(loops: list[FloatArray], rule: FillingRule) -> Outline:
     scaled, scale = scale_for_clipper([loop - center for loop in loops])
     polygons = cast("list[FloatArray]", CrossSection(scaled, fill).to_polygons())
     outline = [np.array(loop, np.float64) for loop in polygons]
-    # In a canonical order, so that the same region always has the same loops.
+    # In a canonical order, so that the same region always has the same loops: each loop begins at
+    # its lowest point (of several, the leftmost).
     outline = [
         np.roll(loop, -int(np.lexsort(loop.T)[0]), axis=0) for loop in outline if len(loop) > 2
     ]

@@ -230,6 +230,7 @@ def _clip_ears(polygon: IntArray, projection: FloatArray) -> IntArray:
 
     ears = np.zeros((0, 3), dtype=np.int64)
     if np.isfinite(projection).all():
+        # A single ring of points, which ends after the last one: there are no holes.
         ends = np.array([len(polygon)], dtype=np.uint32)
         indices = mapbox_earcut.triangulate_float64(_perturb_straight_corners(projection), ends)
         ears = polygon[indices.reshape(-1, 3)]

@@ -165,7 +165,7 @@ class TangentVoronoi:
                 )
             return j + _LINES_PER_ITERATION, area, angle, is_one_sided
 
-        # Zeros of the width of the lanes.
+        # Zeros of the width of the lanes; `zero > 1` is False in all of them.
         zero = backend.Float(0) + 0 * scale
         initial = index(0) + 0 * lane, zero, zero, zero > 1
         condition = _below(line_count)

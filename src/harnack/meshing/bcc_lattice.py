@@ -110,7 +110,8 @@ class BccLattice:
         Raises:
             TriangleLimitError: there are too many cells.
         """
-        # A surface across the box passes through at least this many cells.
+        # A surface across the box passes through at least `min_cells` cells: as many as the
+        # smallest cross-section of the lattice has, the product of the two smaller counts.
         max_cells = min(MOST_CELLS, most_faces)
         if (min_cells := float(np.prod(np.sort(self.counts)[:2].astype(float)))) > max_cells:
             raise triangle_limit_error(min_cells, max_cells)
@@ -127,6 +128,7 @@ class BccLattice:
         edges = self.size * 2**halvings
         root = BoxCells(self.lower + grid.reshape(-1, 3) * edges, edges)
         root = root.subset(~root.is_proved_empty(clearance))
+        # A round tests eight octants of each cell, so the search ends at more than `max_cells`.
         leaves = refine_cells(root, clearance, 8 * max_cells, halvings).occupied
         if not len(leaves.corners):
             return np.zeros((0, 3), np.int64)
@@ -251,7 +253,7 @@ class BccLattice:
                 center = face_corner + 1
                 center[:, axis] = np.clip(face_corner[:, axis] + side, 0, shape[axis] - 1)
                 face_keys.append(_flat_indices(center, shape))
-            # The four corners of the face, in turn around it.
+            # The four corners of the face, in turn around it. (A cell is two lattice units long.)
             for i, j in ((0, 0), (2, 0), (2, 2), (0, 2)):
                 corner = face_corner.copy()
                 corner[:, plane_axes] += [i, j]

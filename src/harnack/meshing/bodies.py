@@ -86,6 +86,7 @@ def _connected_groups(x: FloatArray, faces: IntArray) -> list[IntArray]:
 
     x: (n, 3) the vertices.
     """
+    # `neighbors` lists pairs of half edges; half edge h is one of face h % len(faces).
     group = connected_groups(neighbors(x, faces) % len(faces), len(faces))
     order = np.argsort(group, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(group[order])) + 1)
@@ -277,6 +278,7 @@ def _manifold_of_component(component: TriangleMesh) -> tuple[Manifold, bool]:
     is_outward = volume_of(component.vertices, component.faces) > 0
     if len(crossing := intersecting_faces(component.vertices, component.faces)):
         raise MeshError(f"{len(crossing):,} triangles of a part pass through others of it")
+    # All faces belong to one connected component, number 0.
     if passes_itself(component, np.zeros(len(component.faces), np.int64)):
         raise MeshError("a part passes through itself along edges that lie on faces")
     faces = component.faces if is_outward else component.faces[:, ::-1]

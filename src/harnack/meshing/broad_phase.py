@@ -134,6 +134,7 @@ class _FaceBoxTree:
         real, vector, integer = backend.Float, backend.Array3f, backend.UInt32
         columns = [real(np.ascontiguousarray(column)) for column in self.records[rows].T]
         low, high, own_index = vector(*columns[:3]), vector(*columns[3:6]), columns[_FACE_INDEX]
+        # (An opaque number may change without compiling the kernel again.)
         pair_count, max_count = dr.zeros(integer, 1), dr.opaque(integer, room)
         # The pairs found so far: face own_faces[i] with face partners[i], for i < pair_count.
         own_faces, partners = dr.zeros(integer, room), dr.zeros(integer, room)
@@ -176,7 +177,8 @@ class _FaceBoxTree:
 @dataclass(frozen=True)
 class _PairTests:
     """Tests of pairs of faces, on the device: they prove that the two faces have nothing in common
-    but shared vertices.
+    but shared vertices. `points` is a table of the vertices, and `corners` are the indices of the
+    first, second and third vertices of all faces.
 
     points: the record table of the vertices.
     corners: three index arrays on the device: the first, second and third vertices of all faces.
@@ -267,7 +269,7 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
     def never(*arguments: Any) -> Mask:
         """False in all lanes. It takes the place of the conditions on edges and on a line
         (`_are_apart`) where the condition on a plane holds already."""
-        return arguments[12] < 0
+        return arguments[12] < 0  # the number of shared corners
 
     # The other two conditions are tested on those lanes only on which no plane proves it.
     arguments = (*a, *b, *is_shared_a, *is_shared_b, shared_count)

@@ -221,7 +221,13 @@ def points_off_level(
     volume: Volume | None,
 ) -> tuple[FloatArray, int]:
     """Find the vertices and centers of faces that are not within `tolerance` of the level set, by
-    samples of the function. `check_near_level` describes the test and the parameters.
+    samples of the function: |f| / |grad f| is larger, and f has the same sign at both ends of short
+    segments through the point, along the normal and 13 other lines (`check_near_level`).
+
+    function: f, which is 0 on the level set.
+    vertices, faces: (n, 3), (m, 3) the mesh.
+    tolerance: a length.
+    volume: f counts as positive outside of it; None for no such volume.
 
     Returns these points (k, 3), and the number of points that were tested.
     """

@@ -138,6 +138,7 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     edges = np.concatenate([faces[is_mixed][:, [k, (k + 1) % 3]] for k in range(3)])
     # Edges with one end inside and the other outside; a product of different signs is negative.
     crossed = edges[h[edges[:, 0]] * h[edges[:, 1]] < 0]
+    # A key is the number i * n + j for the edge between the vertices i < j of n.
     keys = np.unique(edge_keys(crossed, len(vertices)))
     a, b = keys // len(vertices), keys % len(vertices)
     # The distance from a plane is linear along the edge.
@@ -159,16 +160,14 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     outer_count = is_out[is_mixed].sum(axis=1)
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
-        tri = rows[(outer_count == 1) & is_out[is_mixed][:, k]][
-            :, order
-        ]  # the first corner is outside
+        # Faces with one corner outside, begun at that corner.
+        tri = rows[(outer_count == 1) & is_out[is_mixed][:, k]][:, order]
         # Two corners inside: the part is a quadrilateral, two triangles. p and q are the points at
         # which the edges at the outer corner are cut.
         p, q = (crossing(tri[:, 1], tri[:, 0]), crossing(tri[:, 2], tri[:, 0]))
         pieces += [np.stack([tri[:, 1], tri[:, 2], p], axis=1), np.stack([tri[:, 2], q, p], axis=1)]
-        tip = rows[(outer_count == 2) & ~is_out[is_mixed][:, k]][
-            :, order
-        ]  # the first corner is inside
+        # Faces with two corners outside, begun at the corner inside: a triangle at it remains.
+        tip = rows[(outer_count == 2) & ~is_out[is_mixed][:, k]][:, order]
         pieces.append(
             np.stack([tip[:, 0], crossing(tip[:, 0], tip[:, 1]), crossing(tip[:, 0], tip[:, 2])], 1)
         )

@@ -40,9 +40,9 @@ _REPAIR_STEPS = 32
 
 
 class ClosedMesh(trimesh.Trimesh):
-    """A trimesh.Trimesh whose `export` writes a closed file if the mesh is closed, or else raises a
-    MeshingError. The mesh in memory stays in double precision, unchanged. A mesh that is not closed
-    is written as trimesh writes it.
+    """A trimesh.Trimesh whose `export` keeps a closed mesh closed: it writes a closed file, or
+    raises a MeshingError if it cannot. A mesh that is not closed is written as trimesh writes it.
+    The mesh in memory stays in double precision, unchanged.
 
     Files hold single precision, in which the ends of short edges coincide and slivers (thin
     triangles) flip. So vertices are rounded to a grid that single precision holds, and edges

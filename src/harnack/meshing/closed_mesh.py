@@ -176,6 +176,7 @@ def extruded_manifold(
     Raises:
         MeshingError: the tolerance is so small that there are millions of faces.
     """
+    # The outline is enlarged by the factor `scale`, and the result is scaled back at the end.
     section, scale = _cross_section(outline)
     inverse_scale = (1 / scale, 1 / scale, 1 / scale)
     if twist == 0:  # neither intermediate sections (0) nor a twist (0.0)
@@ -187,7 +188,7 @@ def extruded_manifold(
     # M L^2/6 = tolerance.
     max_edge = math.sqrt(6 * tolerance / second_derivative)
     straight = section.extrude(height * scale)
-    # The area in squares of the longest edge.
+    # The area in squares of the longest edge; each square has about four triangles.
     square_count = straight.surface_area() / (scale * max_edge) ** 2
     if square_count > _MAX_CELLS:
         raise MeshingError(
@@ -222,6 +223,7 @@ def revolved_manifold(outline: Outline, tolerance: float) -> Manifold:
             f"an outline of radius {radius:g} revolved within {tolerance:.3g} has {segments:,} "
             "segments around: choose a larger `tolerance`"
         )
+    # The outline is enlarged by the factor `scale`, and the result is scaled back.
     section, scale = _cross_section(outline)
     return section.revolve(max(16, segments)).scale((1 / scale, 1 / scale, 1 / scale))
 
@@ -285,11 +287,13 @@ def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
     from manifold3d import Manifold
 
     r = ball.radius
+    # A side of the octahedron becomes segments/4 edges, so each of its 8 faces becomes
+    # (segments/4)^2 faces.
     # From (2 pi r/n)^2/(2 r) <= tolerance, rounded up to a multiple of 4.
     segments = 4 * math.ceil(0.25 * 2 * math.pi * math.sqrt(r / (2 * tolerance)))
     if segments > _MAX_SEGMENTS:
         raise MeshingError(
-            f"a ball of radius {r:g} within {tolerance:.3g} has {2 * segments**2:,} faces: choose "
+            f"a ball of radius {r:g} within {tolerance:.3g} has {segments**2 // 2:,} faces: choose "
             "a larger `tolerance`"
         )
     x, y, z = ball.center

@@ -136,6 +136,7 @@ class Shells:
     """The connected components of a closed surface with m faces, called shells. A shell has a
     positive volume if its faces look outwards, and a negative volume if it is turned inwards, as
     around a cavity. Its winding number around a point is 1 or -1 inside of it, and 0 outside.
+    `lower` and `upper` are the corners of the shells' boxes, and `corners` those of the faces.
 
     component_of_face: (m,) the index of the component of each face.
     volumes: (k,) the signed volumes of the components.

@@ -142,7 +142,8 @@ class CsgMesher:
     """Meshes solids and their Boolean combinations in the box from `lower` to `upper`, (3,) each.
     It goes down the tree of operands, meshes the level set of each leaf in a lattice of cells, and
     combines the results. The attributes from `evaluations` to `smallest_cell` count what was done
-    so far.
+    so far. `intersected_with` are solids with which the meshed one will be intersected, so that
+    nothing need be meshed where one of them has no points.
 
     tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
         surface.
@@ -186,6 +187,7 @@ class CsgMesher:
         Raises:
             MeshingError: the solid or one of its operands cannot be meshed.
         """
+        # A method returns None for a solid that is to be meshed as a level set.
         for kind, method in self.methods.items():
             manifold = method(self, solid, level) if isinstance(solid, kind) else None
             if manifold is not None:
@@ -245,7 +247,8 @@ class CsgMesher:
         if not solid.is_union:
             others = [operand for operand in solid.parts if operand is not part]
             if isinstance(part, Complement):
-                # Inside of a complement only these operands count: the second part of the proof.
+                # Inside of a complement only these operands count, and none of the operations
+                # around this one (the second part of the proof at `IntersectedOperands`).
                 self.intersected_with = tuple(
                     (operand, level) for operand in others if _is_complement_free(operand)
                 )
@@ -359,8 +362,8 @@ class CsgMesher:
         angle it lies between two level sets with a common boundary curve.
 
         Raises:
-            MeshingError: the wall is thinner than the tolerance, or its field has a period and is
-                no solid angle.
+            MeshingError: g is the function of a plain field, no solid, and the wall is thinner than
+                twice the tolerance; or g has a period and is no solid angle.
         """
         from manifold3d import Manifold
 
@@ -371,6 +374,8 @@ class CsgMesher:
         field = wall.field
         if field.period is None:
             inside = SublevelSolid(field)
+            # The estimate of the thickness is for plain fields. A wall about the surface of a solid
+            # is only checked as every mesh is, after its parts were put together.
             if not isinstance(field, Solid):
                 self._check_wall_thickness(field, low, high)
             return self.mesh_sublevel(inside, high) - self.mesh_sublevel(inside, low)
@@ -450,8 +455,10 @@ class CsgMesher:
         surface = mesh_closed_surface(function, lattice, self.tolerance, self.report, as_cut=True)
         manifold = to_manifold(surface)
         self.levels += 1
+        # If all lengths of merging fail, `surface` stays the unmerged mesh.
         for fraction in _MERGED_WITHIN:
             joined = from_manifold(without_short_edges(manifold, fraction * self.tolerance))
+            # Triangles across creases are cut, in at most `_SPLITS` rounds.
             joined = split_faces_off_level(function, joined, _FAR_OFF * self.tolerance, _SPLITS)
             try:
                 surface = resolve_self_intersections(joined, _MENDED_WITHIN * self.tolerance)
@@ -751,8 +758,9 @@ def mesh_solid(
     attempts = _MAX_ATTEMPTS if spacing is None else 1
     per_wave = CELLS_PER_WAVE if spacing is None else None
     uploads = CallCache()
-    first: MeshingError | None = None
-    before: MeshingError | None = None
+    # The errors of the first attempt, and of the one before the current attempt.
+    first_failure: MeshingError | None = None
+    previous_failure: MeshingError | None = None
     while True:
         mesher = CsgMesher(
             lower, upper, max_error, cell_size, per_wave, angle_mesher(max_error, cell_size),
@@ -764,14 +772,18 @@ def mesh_solid(
             surface = _check_and_mend(mesher, solid, level, surface, size, check)
             break
         except TriangleLimitError as too_large:
-            if first is None:
+            if first_failure is None:
                 raise
-            raise first from too_large  # the first error is the cause
+            # It was the first error that led to so small cells.
+            raise first_failure from too_large
         except (MissedPartsError, LocalizedMeshingError) as failure:
-            attempts, first = attempts - 1, first or failure
-            if not attempts or not is_retry_promising(failure, before, CELL_SIZE_RATIO**attempts):
+            attempts, first_failure = attempts - 1, first_failure or failure
+            # Give up after the last attempt, or if even the smallest cells to come would not help.
+            if not attempts or not is_retry_promising(
+                failure, previous_failure, CELL_SIZE_RATIO**attempts
+            ):
                 raise
-            before = failure
+            previous_failure = failure
             cell_size *= CELL_SIZE_RATIO
             # More cells along a wave in proportion, as these may limit the size of cells.
             per_wave = CELLS_PER_WAVE * size / (_CELLS_ACROSS * cell_size)

@@ -263,27 +263,30 @@ def mesh_spanning_curve(
     """
     task = _SpanningInput(function, *box, box if has_walls else None, seed, report)
     walls = task.walls
+    # Sets of balls in which cells are made smaller.
     finer: tuple[RefinementBalls, ...] = ()
     # The mesh with the fewest faces turned over, of those whose triangles do not cross.
     best: SpanningMesh | None = None
     crossing = np.zeros(0, np.int64)
     for attempt in range(_MAX_ATTEMPTS):
-        first = _mesh_with_retries(task, spacing, attempts, finer)
-        spacing, finer = first.spacing, first.finer
-        faces = first.faces
-        check_estimated_triangles(function, first.vertices, faces, tolerance)
-        vertices = smooth(function, first.vertices, faces, walls)
+        unrefined = _mesh_with_retries(task, spacing, attempts, finer)
+        spacing, finer = unrefined.spacing, unrefined.finer
+        faces = unrefined.faces
+        check_estimated_triangles(function, unrefined.vertices, faces, tolerance)
+        vertices = smooth(function, unrefined.vertices, faces, walls)
         vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
         vertices, faces = improve(function, vertices, faces, tolerance, walls, report)
         turned = misoriented_faces(function, vertices, faces)
         curve_count = sum(map(len, _curve_loops(function)))
         vertices, faces = restore_curve_edges(
-            function, vertices, faces, curve_count, len(first.curve.points), tolerance
+            function, vertices, faces, curve_count, len(unrefined.curve.points), tolerance
         )
         check_manifold(faces)
         crossing = intersecting_faces(vertices, faces)
         if not len(crossing) and (best is None or len(turned) < best.turned):
-            best = dataclasses.replace(first, vertices=vertices, faces=faces, turned=len(turned))
+            best = dataclasses.replace(
+                unrefined, vertices=vertices, faces=faces, turned=len(turned)
+            )
         failing = np.union1d(crossing, turned)
         if not len(failing):
             break
@@ -328,6 +331,7 @@ def _mesh_with_retries(
                 return _mesh_in_cells(task, spacing, balls)
             except LocalizedMeshingError as error:
                 task.report(f"{len(error.locations)} places fail: smaller cells there")
+                # The balls' radius is the size of the cells that failed; each trial halves it.
                 balls = (*balls, RefinementBalls(error.locations, spacing * 0.5**trial))
         return _mesh_in_cells(task, spacing, balls)
     # No places are known, or the last local attempt failed.
@@ -355,6 +359,7 @@ def _mesh_in_cells(
     # smaller cells are wanted.
     for k, balls in enumerate(finer):
         curve = curve.split_near(balls, spacing * 0.5**k)
+    # A surface that does not end at the box must lie inside of the cells.
     margin = 0.5 * spacing if walls is None else 0.0
     root = box_cells(task.lower - margin, task.upper + margin, spacing, exact=walls is not None)
     curve, points, tets = _tetrahedralize(task, root, curve, finer)
@@ -421,7 +426,7 @@ def _check_boundary(
         distances = np.minimum(np.abs(vertices - walls[0]), np.abs(vertices - walls[1]))
         is_on_wall = np.asarray((distances <= margin).any(axis=1))
         edges = edges[~is_on_wall[edges].all(axis=1)]
-    # Edges that are in one of the two sets only.
+    # Edges that are in one of the two sets only, by their keys: a * count + b for vertices a < b.
     unmatched = np.setxor1d(edge_keys(edges, count), edge_keys(curve.edges, count))
     if len(unmatched):
         ends = np.stack(np.divmod(unmatched, count), axis=1)

@@ -347,6 +347,7 @@ def _move_onto_level(
     """
     near = np.flatnonzero(samples.distance < _SNAP_DISTANCE * size)
     size = size[near]
+    # Steps of at most a quarter of a cell, and moves of at most 0.45 cells.
     moved, new_samples, is_moved = snap_to_level(
         function, points[near], samples.select(near), size,
         0.25 * size, 1.5 * _SNAP_DISTANCE * size, walls,

@@ -126,7 +126,7 @@ def to_trimesh(surface: TriangleMesh, facts: dict[str, Any], is_closed: bool) ->
                 "the part did not close, or is inside out: choose a smaller `cell_size`"
             )
         facts = {**facts, "volume": volume}
-    # The function is larger inside.
+    # Faces look to where the function is larger. If that is inside, they are turned over.
     elif not len(boundary) and mesh.volume < 0:
         mesh.invert()
     mesh.metadata["harnack"] = {
@@ -147,5 +147,6 @@ def _crease_count(surface: TriangleMesh, edges: Edges) -> int:
     edges: the `Edges` of the `half_edges` of the surface's faces.
     """
     normals = unit_normals(surface.vertices[surface.faces])
+    # Half edge h is one of face h % m.
     pairs = edges.paired_half_edges() % len(surface.faces)
     return int((row_dots(normals[pairs[:, 0]], normals[pairs[:, 1]]) < _CREASE_COSINE).sum())

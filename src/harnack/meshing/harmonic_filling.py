@@ -155,7 +155,8 @@ def _fill_all_holes(
     Raises:
         MeshingError: the filling could not be computed, or intersects the mesh or itself.
     """
-    if not len(edges):  # no hole: no vertices and no faces
+    # No hole: no vertices, no faces, nothing to refine, no cells and no evaluations.
+    if not len(edges):
         return HarmonicFilling(vertices[:0], faces[:0], True, 0.0, 0)
     # Each boundary edge counts once, in its direction.
     loops = singular_loops(edges, np.ones(len(edges), np.int64))
@@ -318,6 +319,7 @@ def _mesh_patches(
     lower, upper = (np.array(end, np.float64) for end in extent.bounds())
     # Cells around all points in which the level set can lie.
     root = box_cells(lower - 0.5 * spacing, upper + 0.5 * spacing, spacing, exact=False)
+    # `halved` lists the ends of the edges that are halved. (Below, None: there are no walls.)
     curve, halved = boundary, np.zeros((0, 2), np.int64)
     points = sample_delaunay_points(function, root, curve, None, seed, finer)
     tets = delaunay(points.points)

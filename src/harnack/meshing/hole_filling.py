@@ -536,6 +536,7 @@ def _split_long_edges(x: FloatArray, new: IntArray) -> tuple[FloatArray, IntArra
     midpoint = np.full(len(edges.vertices), -1, np.int64)
     midpoint[rows] = len(x) + np.arange(len(rows))
     x = np.concatenate([x, ends[rows].mean(axis=1)])
+    # For each face (p, 3) the midpoints of its edges; -1 for edges that are not split.
     return x, split_faces(x[:, :3], new, midpoint[edges.edge_of_pair].reshape(3, -1).T)
 
 
@@ -714,6 +715,7 @@ def _loop_of_faces(new: IntArray, loops: list[IntArray], count: int) -> IntArray
     count: the number of vertices.
     """
     edges = Edges.of(half_edges(new))
+    # Half edge h is one of face h % len(new).
     part = connected_groups(edges.paired_half_edges() % len(new), len(new))
     loop_at = np.full(int(part.max()) + 1, -1, np.int64)
     keys = edge_keys(edges.vertices, count)

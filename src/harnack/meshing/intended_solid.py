@@ -66,7 +66,8 @@ _OPEN_SHARE = 0.4
 class Difference:
     """How the closed surface that a repair returned differs from the input mesh. A compared point
     is on the wrong side if the input's winding number tells clearly that it should be inside and it
-    is outside of the surface, or the reverse.
+    is outside of the surface, or the reverse. `share` is the fraction of such points, and `missing`
+    and `added` are how many there are of the first and of the second kind.
 
     share: the fraction of the compared points that are on the wrong side.
     places: (k, 3) some of these points.
@@ -112,8 +113,9 @@ class Difference:
 @dataclass(frozen=True)
 class IntendedSolid:
     """The solid that a damaged mesh is meant to bound: the mesh with equal corners joined, and with
-    faces turned over so that it is not inside out. A closed part of it is a connected group of
-    faces that run every edge as often in one direction as in the other.
+    faces turned over so that it is not inside out (the faces `oriented`). A closed part of it (one
+    of `parts`) is a connected group of faces that run every edge as often in one direction as in
+    the other.
 
     vertices, faces: (n, 3), (m, 3) the mesh.
     is_turned: (m,) mask of the faces whose orientation was reversed.
@@ -156,7 +158,8 @@ class IntendedSolid:
             faces = joined
         # Faces that still have three different corners.
         rows = np.flatnonzero(has_distinct_corners(joined))
-        # Every face has its reverse: keep one of both.
+        # No faces are left (`net`) if equal faces are added and opposite ones cancel, so every face
+        # has its reverse: keep one of both.
         if not len(welded.net.faces):
             rows = rows[np.unique(np.sort(joined[rows], axis=1), axis=0, return_index=True)[1]]
         joined, is_turned = joined[rows], np.zeros(len(faces), np.bool_)
@@ -251,6 +254,7 @@ class IntendedSolid:
         are farther than `away` from the surface."""
         points, w = self.samples
         corner = surface.vertices[surface.faces]
+        # (Another seed than that of `samples`.)
         near_surface = _near(corner, self.size, np.random.default_rng(1))
         points, w = (
             np.concatenate([points, near_surface]),
@@ -278,7 +282,7 @@ class IntendedSolid:
         are compared only for a closed mesh that winds around no point twice or clockwise; for other
         meshes the result is None."""
         _, w = self.samples
-        # Edges that do not cancel: the mesh is not closed.
+        # No field: there are no faces. Singular edges, which do not cancel: the mesh is not closed.
         if self.field is None or len(self.field.mesh.singular_edges):
             return None
         if (w > 1.5).any() or (w < -0.5).any():

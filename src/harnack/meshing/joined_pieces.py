@@ -62,10 +62,11 @@ def passes_itself(surface: TriangleMesh, number: IntArray) -> bool:
     two sides of the other part. So the winding numbers beside pieces of touching faces are not the
     same all over a connected component. If no sheet passes through another, they are the same all
     over it, since they change at no other place."""
-    pairs, _ = touching_pairs(surface.vertices, surface.faces)
+    pairs, _ = touching_pairs(surface.vertices, surface.faces)  # without the points of contact
     if not len(pairs):
         return False
     cut = _Cut.of(surface.vertices, surface.faces, np.unique(pairs))
+    # Winding numbers beside thin pieces may be wrong, so these are left out.
     windings = np.column_stack([number[cut.owner], cut.front, cut.back])[cut.is_thick]
     # More pairs of winding numbers than components: some component has two pairs.
     distinct_windings = np.unique(windings, axis=0)
@@ -91,6 +92,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     if not is_boundary.any():
         raise MeshingError("the solid is empty: the mesh winds around no point")
     pieces = cut.pieces[is_boundary]
+    # The solid is on the side with the larger winding number; faces must look away from it.
     is_inward = (cut.front > cut.back)[is_boundary]
     pieces = np.where(is_inward[:, None, None], pieces[:, ::-1], pieces)
     # Corners of pieces that are at the same place, up to rounding, become one vertex.
@@ -101,6 +103,7 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
     # Pieces of which two corners became one vertex have no area.
     joined = joined[has_distinct_corners(joined)]
     joined = _cut_at_corners(points, joined)
+    # New vertices, back from the unit of the cut to that of the mesh.
     all_vertices = np.concatenate([x, cut.center + cut.size * points[len(x) :]])
     return TriangleMesh.without_unused_vertices(*_apart_at_contacts(all_vertices, joined))
 
@@ -108,10 +111,9 @@ def boundary_of_solid(vertices: FloatArray, faces: IntArray) -> TriangleMesh:
 @dataclass(frozen=True)
 class _Cut:
     """Some faces of a mesh, cut along each other into triangles ("pieces"), and the winding numbers
-    of the whole mesh on both sides of each piece.
-
-    Lengths are scaled so that coordinates are at most about one: center + size * x is the original
-    position of x.
+    of the whole mesh on both sides of each piece, `front` and `back`; the normal of a piece points
+    to its front. Lengths are scaled so that coordinates are at most about one: center + size * x is
+    the original position of x. `unit` are the scaled vertices of the mesh.
 
     tree: of the faces that were cut.
     unit: (n, 3) the vertices of the mesh, scaled.
@@ -216,6 +218,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
             break
         count = len(x)
         # Find the sides of faces that are edges to be cut; a face is cut at one side in a round.
+        # The key of an edge between vertices a < b is a * count + b.
         keys = edges[is_cut] @ [count, 1]
         face_keys = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
         position = np.searchsorted(keys, face_keys).clip(max=len(keys) - 1)
@@ -226,6 +229,7 @@ def _cut_at_corners(x: FloatArray, faces: IntArray) -> IntArray:
         # The vertex at which the side from a to b is cut.
         p = vertex_on_edge[is_cut][position[rows, side]]
         halves = [np.column_stack([a, p, c]), np.column_stack([p, b, c])]
+        # A half of a face that has the vertex p as a corner already has no area.
         halves = [half[(half[:, 0] != half[:, 2]) & (half[:, 1] != half[:, 2])] for half in halves]
         faces = np.concatenate([np.delete(faces, rows, axis=0), *halves])
         edges, _ = singular_edges(faces)
@@ -255,6 +259,7 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
     direction = (q - p)[edge_row] / np.maximum(2 * half_length[edge_row], 1e-300)[:, None]
     relative = x[candidate] - p[edge_row]
     position = row_dots(relative, direction)
+    # On the line of the edge up to rounding (`_SAME`), and strictly between its ends.
     is_on = row_norms(relative - position[:, None] * direction) <= _SAME
     is_on &= (candidate != edges[edge_row, 0]) & (candidate != edges[edge_row, 1])
     is_on &= (position > 0) & (position < 2 * half_length[edge_row])
@@ -263,6 +268,7 @@ def _corners_on(x: FloatArray, edges: IntArray) -> tuple[IntArray, BoolArray]:
         candidate[is_on],
         np.abs(position - half_length[edge_row])[is_on],
     )
+    # Of each edge's candidates, the first in the order of their distances from its middle.
     order = np.lexsort((distance, edge_row))
     edge_row, first = np.unique(edge_row[order], return_index=True)
     vertex_on_edge, is_cut = np.zeros(len(edges), np.int64), np.zeros(len(edges), np.bool_)
@@ -286,6 +292,7 @@ def neighbors(x: FloatArray, faces: IntArray) -> IntArray:
         # The half edges at this edge; half edge h is of the face h % m.
         edge_halves = edges.pairs_by_edge[start[k] : start[k] + edges.multiplicity[k]]
         is_along = pairs[edge_halves, 0] == edges.vertices[k, 0]
+        # The sum of a face's three corners minus the two ends of the edge.
         third_corner = faces[edge_halves % m].sum(axis=1) - pairs[edge_halves].sum(axis=1)
         neighbor_pairs.append(edge_halves[_wedges(x[edges.vertices[k]], x[third_corner], is_along)])
     return np.concatenate(neighbor_pairs)

@@ -98,7 +98,8 @@ _FLAT_RADIUS = 0.25
 
 class MissedPartsError(MeshingError):
     """The error for a level set with parts that the mesh misses, because they pass between the
-    points of the lattice, as a wall thinner than a cell does.
+    points of the lattice, as a wall thinner than a cell does. `places` are points of the longest
+    missed part, `thickness` is how thick it is at each of them, and `size` is the size of a cell.
 
     places: (k, 3) points on the level set, in the longest missed part.
     thickness: (k,) thicknesses of the part at these points, lengths: 2^-7, 2^-6, ..., 1 cells; 0 if
@@ -704,7 +705,8 @@ def _sample_lattice(
             everywhere.
     """
     count = len(points)
-    # The values of points that are not evaluated: far above the level.
+    # The values of points that are not evaluated: far above the level. (From `OUTSIDE_VALUE` on, a
+    # value stands for the outside, and edges that end there are cut in the middle.)
     samples = LevelSamples(np.full(count, 10 * OUTSIDE_VALUE), np.ones((count, 3)), np.zeros(count))
     points = points[~is_irrelevant]
     samples = samples.replaced(~is_irrelevant, function.sample(points))

@@ -81,6 +81,8 @@ class LevelSamples:
 @dataclass
 class LevelFunction:
     """The function f - level of a field f, evaluated in double precision at arrays of points.
+    `evaluations` counts these points. `_prepared` is the field as it is evaluated on the device
+    (`_backend`), and `_levels` holds the level there.
 
     most_faces: the largest allowed number of triangles of the level set's mesh.
     uploads: holds fields prepared for double precision; several functions may share it.
@@ -101,7 +103,7 @@ class LevelFunction:
         self._prepared = self.uploads.get_or_make(
             self.field, "evaluator", lambda: self.field.prepare(self._backend)
         )
-        # Data, so that other levels compile nothing.
+        # Opaque numbers are data of kernels, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)
         self._levels = Levels((level,), self.field.period)
 

@@ -210,6 +210,8 @@ class LostParts:
         thickness, is_inside = _thicknesses(function, measured, spacing)
         is_thin = np.isfinite(thickness)
         thickness = thickness[is_thin]
+        # far, looked_at, tolerance, beyond, within; the places missing, filled and undecided;
+        # thickness, spacing and advice.
         return cls(
             len(distant.points),
             len(known.points),

@@ -358,6 +358,7 @@ def _sides(points: TetrahedronPoints, tets: Tetrahedra, crossings: EdgeCrossings
     """
     is_on = points.is_on_level[tets.corners]
     rows = np.arange(len(is_on))
+    # (`argmin` finds the first False.)
     first_free_corner = np.argmin(is_on, axis=1)
     side = np.zeros(is_on.shape, np.int64)
 
@@ -541,6 +542,7 @@ def _faces_on_the_level(
     else:
         period = function.period
         value = function.values(middle)
+        # The continuous change from the first point over the face's center to the second.
         change = sum(
             sign
             * _integrate_change(function.field, side, middle, _wrap(value - start, period), period)
@@ -549,6 +551,8 @@ def _faces_on_the_level(
                 (-1, second_point, second_value),
             )
         )
+        # Reduced to [0, period), the first value plus the change exceeds the second value by one
+        # period for each level crossed.
         difference = np.remainder(first_value, period) + change - np.remainder(second_value, period)
         crossing_count = np.round(difference / period).astype(np.int64)
     rise = (second_point - first_point) * np.sign(crossing_count)[:, None]

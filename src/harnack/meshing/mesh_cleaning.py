@@ -135,9 +135,8 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
         mean = np.stack([np.bincount(group, column) for column in points.T], axis=1) / count
         renumbered = group[corners]
         welded_faces = renumbered[has_distinct_corners(renumbered)]
-        lost_edges = 3 * (
-            len(faces) - len(welded_faces)
-        )  # a lost triangle counts as three open edges
+        # A lost triangle counts as three open edges.
+        lost_edges = 3 * (len(faces) - len(welded_faces))
         largest_move = float(row_norms(mean[group] - points).max())
         candidates.append(
             (len(boundary_edges(welded_faces)) + lost_edges, mean, welded_faces, largest_move)
@@ -155,7 +154,7 @@ def weld_near_corners(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray
 @dataclass(frozen=True)
 class _WorkingMesh:
     """A mesh while it is cleaned. It knows from which face of the damaged mesh (the input) each of
-    its faces comes.
+    its faces comes, whether it was turned over, and how many input faces were removed so far.
 
     vertices: (n, 3), those of the input first. faces: (m, 3).
     source_face: (m,) the index of the input face that each face is; -1 for a face of a filling.
@@ -213,6 +212,7 @@ class _WorkingMesh:
         possible are removed too."""
         working = self.without_fins()
         edges = Edges.of(half_edges(working.faces))
+        # (`edge_of_pair` lists the first edges of all faces, then the second, then the third.)
         is_at_overused_edge = np.asarray(
             (edges.multiplicity > 2)[edges.edge_of_pair].reshape(3, -1).any(axis=0)
         )
@@ -276,6 +276,8 @@ class _WorkingMesh:
         filling = fill_holes(
             self.vertices, self.faces, loops, lambda p: field.value(p, precision="double")
         )
+        # New faces come from no face of the input (-1), and are not turned. `counts` stays, since
+        # no face was removed.
         new_count = len(filling.faces)
         filled_mesh = _WorkingMesh(
             np.concatenate([self.vertices, filling.vertices]),
@@ -304,7 +306,7 @@ class _WorkingMesh:
             MeshingError: the surface passes through itself.
         """
         # A rank above all indices of input faces puts fillings last.
-        filling_rank = len(self.vertices) + len(self.source_face)
+        filling_rank = int(self.source_face.max(initial=-1)) + 1
         order = np.argsort(
             np.where(self.source_face < 0, filling_rank, self.source_face), kind="stable"
         )

@@ -309,8 +309,9 @@ def relax_vertices(
 
 @dataclass(frozen=True)
 class _VertexStars:
-    """The stars of k vertices: the faces around each of them. They are stored as p pairs of a
-    vertex and a face around it.
+    """The stars of k vertices (`centers`): the faces around each of them. They are stored as p
+    pairs of a vertex and a face around it. Of each pair, `owner` is the vertex, as a position in
+    `centers`; `face` is the index of the face; and `corners` are its corners, the vertex first.
 
     centers: (k,) the indices of the vertices.
     owner: (p,) the vertex of each pair, as a position in `centers`.
@@ -394,6 +395,7 @@ def _best_places(
             best[is_better], best_angle[is_better] = x[is_better], angle[is_better]
     # Only the best position is moved onto the level set. That changes it little, since the targets
     # are near the level set.
+    # (1e-300 keeps it above 0.)
     span = row_norms(best - start) + 1e-300
     best = newton_to_level(function, best, function.sample(best), 2 * span, walls, steps=4)
     return best, _least_at(best, stars, a, b, normal)
@@ -431,6 +433,8 @@ def _independent_moves(
     stars, faces: the faces around the k vertices, and all faces (m, 3) of the mesh.
     vertex_count: the number of vertices of the mesh.
     """
+    # For each vertex its rank among the candidates, 0 for the one that gains most; for each star
+    # the best rank in it.
     rank = np.full(vertex_count, len(rows))
     ordered = rows[np.argsort(-gain[rows], kind="stable")]
     rank[stars.centers[ordered]] = np.arange(len(rows))
@@ -470,6 +474,7 @@ def _moves_stay_near(
     is_near &= samples.distance <= tolerance
     failure_count = np.zeros(len(stars.centers), np.int64)
     np.add.at(failure_count, stars.owner[pairs[~is_near]], 1)
+    # On the level set: the distance is tiny compared with the move, or with the tolerance.
     length = row_norms(targets[rows] - vertices[stars.centers[rows]])
     is_target_on_level = function.sample(targets[rows]).distance <= 1e-7 * np.maximum(
         length, 0.1 * tolerance

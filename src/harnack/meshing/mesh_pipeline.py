@@ -379,6 +379,7 @@ def _mesh_from_signs(
         return made.surface
 
     if not solid:
+        # (False: the mesh may end at the box; parts of its faces do not close it.)
         made = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
             # The box itself has cut the mesh already if the clip is a box.
@@ -409,6 +410,7 @@ def _mesh_from_signs(
         metadata["cloud"] = field.describe()
     is_told = _check_sign_accuracy(field, metadata, asked.tolerance.at(size))
     _warn_of_lost(field, losses, is_told)
+    # No check of the level (`_accept`): distances from it have been measured.
     return _RawMesh(made, size, metadata, function(levels[0], 1.0), _accept, is_intersection_free)
 
 

@@ -213,6 +213,7 @@ def _project_to_creases(
     h_a, h_b = row_dots(n_a, a - middle), row_dots(n_b, b - middle)
     weights = np.stack([h_a - cosine * h_b, h_b - cosine * h_a]) / (1 - cosine**2)
     direction = weights[0][:, None] * n_a + weights[1][:, None] * n_b
+    # Segments to the crease are at most `_OFFSET` times as long as the edge.
     projected, is_found = _level_along(function, middle, direction, _OFFSET * span, walls)
     is_found &= np.minimum(row_norms(projected - a), row_norms(projected - b)) > _FROM_ENDS * span
     moved = moved.copy()
@@ -264,6 +265,7 @@ def _crease_corners(
     offsets = (normal * (corner - center[:, None])).sum(axis=2)
     solve: Any = np.linalg.solve
     direction: FloatArray = solve(normal[rows], offsets[rows][:, :, None])[:, :, 0]
+    # Segments to the corner are at most `_OFFSET` times as long as the longest edge.
     crossing, is_found = _level_along(
         function, center[rows], direction, _OFFSET * longest_edge[rows], walls
     )
@@ -533,7 +535,8 @@ def smooth(
                 )
         target = 0.5 * (vertices + neighbor_sum / neighbor_count[:, None])
         target_samples = function.sample(target[free_rows])
-        # Newton's steps are limited to twice the move: beside the boundary, gradients turn.
+        # Newton's steps are limited to twice the move: beside the boundary, gradients turn. (1e-300
+        # keeps the limit above 0.)
         move_length = row_norms(target[free_rows] - vertices[free_rows]) + 1e-300
         moved = vertices.copy()
         moved[free_rows] = newton_to_level(

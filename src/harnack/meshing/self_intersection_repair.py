@@ -149,7 +149,8 @@ def _faces_at_corners(faces: IntArray, targets: IntArray) -> IntArray:
 @dataclass(frozen=True)
 class _Neighborhood:
     """A few faces of a mesh that are changed together, with their vertices numbered from 0. Their
-    edges are contracted and flipped without a change of the rest of the mesh.
+    edges are contracted and flipped without a change of the rest of the mesh. Only vertices of the
+    mask `is_movable`, all of whose faces belong to the neighborhood, may be removed.
 
     vertices: (n, 3). faces: (m, 3).
     is_movable: (n,) the mask of the vertices that may be removed. All faces at such a vertex belong

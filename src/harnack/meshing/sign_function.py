@@ -343,7 +343,8 @@ class SignFunction(LevelFunction):
             """The t and the normal of the first crossing of a jump surface along rays o + t d, for
             t up to limit.x; t is infinite if there is none."""
             zero = backend.Array3f(0)
-            # The place t = 0 of the ray, on no facet.
+            # The place t = 0 of the ray, on no facet, with no jump and no normal. All lanes are
+            # active (True).
             ray_start = JumpCrossing(
                 backend.Float(0), backend.UInt32(NO_FACET), backend.Float(0), zero
             )

@@ -559,14 +559,16 @@ class _CreaseRefinement:
         a, b = x[ends[:, 0]], x[ends[:, 1]]
         fraction, to_line, sine2 = _toward_tangent_planes(a, b, one, other)
         edge_length = row_norms(b - a)
-        # Of these, the edges that are far from the line between the tangent planes.
+        # Of these, the edges that are far from the line in which the tangent planes meet; neither
+        # nearly parallel planes nor short edges.
         is_far = (
             (sine2 > _MIN_SQUARE)
             & (row_norms(to_line) > tolerance)
             & (edge_length > _SHORTEST * tolerance)
         )
         rows, to_line, fraction = rows[is_far], to_line[is_far], fraction[is_far]
-        # Of these, the edges beside which the level set is found.
+        # Of these, the edges beside which the level set is found, on segments at most `_OFFSET`
+        # times as long as the edge.
         foot, far_length = a[is_far] + fraction[:, None] * (b - a)[is_far], edge_length[is_far]
         points, new_normal, is_found = _level_along(function, foot, to_line, _OFFSET * far_length)
         rows, points, new_normal, fraction = (
@@ -583,7 +585,8 @@ class _CreaseRefinement:
         )
         is_bent = np.concatenate([bent, is_on_crease])
         new_vertices_of_face = vertex_of_edge[edges]
-        # Faces whose three new vertices all lie on creases; then those that get an inner vertex.
+        # Faces whose three new vertices all lie on creases; then those that get an inner vertex. (0
+        # in place of -1: the first condition has excluded these faces.)
         fan_rows = np.flatnonzero(
             (new_vertices_of_face >= 0).all(axis=1)
             & is_bent[np.maximum(new_vertices_of_face, 0)].all(axis=1)
@@ -600,6 +603,8 @@ class _CreaseRefinement:
     def applied(self, x: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
         """Split the edges and faces of the mesh `x` (n, 3), `faces` (m, 3). Returns the vertices of
         the finer mesh, the given ones first, and its faces."""
+        # `rows` and `corner_faces` are the faces that get an inner vertex; these come last in
+        # `points`.
         vertices = np.concatenate([x, self.points])
         middle = self.vertex_of_edge[self.edges]
         is_without_inner = np.ones(len(faces), np.bool_)
@@ -773,6 +778,7 @@ def _folded_faces(x: FloatArray, faces: IntArray, among: BoolArray) -> IntArray:
     rounding: the normals of both are opposite. A pair of neighbors is tested if the mask `among`
     (m,) is set for at least one of the two."""
     normal = unit_normals(x[faces])
+    # Half edge h is one of face h % len(faces).
     pairs = Edges.of(half_edges(faces)).paired_half_edges() % len(faces)
     first, second = pairs.T
     is_folded = (row_dots(normal[first], normal[second]) < _FOLDED) & (among[first] | among[second])

@@ -121,6 +121,7 @@ def _why_too_thick(surface: TriangleMesh, normals: FloatArray, thickness: float)
     areas = np.linalg.norm(face_normals, axis=1)
     tree = kd_tree(surface.vertices)
     vertex_ids = np.arange(len(surface.vertices))
+    # Of each moved vertex, the nearest 16 vertices are looked at.
     neighbor_count = min(16, len(vertex_ids))
     edges_of_mesh = sorted_unique(edge_keys(half_edges(surface.faces), len(vertex_ids)))
     for sign in (1, -1):

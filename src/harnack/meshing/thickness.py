@@ -71,6 +71,7 @@ class WallThickness:
         import trimesh  # imported here: it takes half a second
 
         fraction = np.clip((self.values - low) / max(high - low, 1e-300), 0.0, 1.0)
+        # Faces without an area have no thickness; they are gray.
         fraction = np.nan_to_num(fraction, nan=1.0)
         stops = np.array([[200, 30, 30], [240, 200, 60], [190, 190, 190]], np.float64)
         colors = np.full((len(fraction), 4), 255, np.uint8)
@@ -140,8 +141,9 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     """
     size = solid.surface.size
     start_depth = _START_DEPTH * size
-    # The tolerance is relative to the mesh: with a fixed one, rays into a small mesh would end
-    # where they start.
+    # Rays begin inside, at the depth `start_depth`, and hits within as much again do not count. The
+    # tolerance is relative to the mesh: with a fixed one, rays into a small mesh would end where
+    # they start.
     hits: Any = trace(
         solid, start - start_depth * normal, -normal,
         t_min=start_depth, tolerance=0.1 * start_depth, precision="double",

@@ -94,6 +94,7 @@ def _vertices(
     continued = height[-shift:] + lead, radii[-shift:]
     z = height[:, None] + lead * angle / (2 * math.pi)
     x, y = radii[:, None] * np.cos(angle), radii[:, None] * np.sin(angle)
+    # At angle 0, x is the radius and y is 0.
     last = np.column_stack([continued[1], 0 * continued[1], continued[0]])
     return np.concatenate([np.stack([x, y, z], axis=-1).reshape(-1, 3), last])
 

@@ -77,14 +77,15 @@ def _check_branch_point(
     period: float | None = branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     bound = point.constant * radii**point.power
-    # The largest difference of any branch from the stated value, at each point.
+    # The largest difference of any branch from the stated value, at each point; NaN if a branch is
+    # NaN, so that the test fails.
     errors = np.zeros(_POINT_COUNT)
     for branch in branches.evaluate(complex_type(backend)(backend.Float(x), backend.Float(y))):
         component = branch.value.imag if imaginary else branch.value.real
         error: FloatArray = to_numpy(component) - value
         if period is not None:
             error = error - period * np.round(error / period)
-        errors = np.fmax(errors, np.abs(error))
+        errors = np.maximum(errors, np.abs(error))
     # The rounding of the bound, of the values and of the point's location.
     rounding = _ROUNDING * (bound + 1e-6 * abs(value)) + 2.0**-48 * (
         abs(value) + np.abs(point.location)

@@ -102,6 +102,7 @@ def _spacing_within(
     is_inside = np.ones(len(points), dtype=np.bool_)
     if field.domain is None:
         return h, is_inside
+    # At most 24 halvings: a point that is so near to the border has no spacing.
     for _ in range(24):
         is_inside[:] = True
         # The domain is convex, so it is enough to test the outermost nodes.
@@ -119,7 +120,9 @@ def _spacing_within(
 @dataclass(frozen=True)
 class _StencilSample:
     """The samples of a field at one node of central differences around n points: for each point,
-    the node is at the position node * h from it along a coordinate axis.
+    the node is at the position node * h from it along a coordinate axis. `weight` and `wide` are
+    the node's weights in the differences with the spacings h and 2h, and `move` is the value at the
+    node minus the value at the point.
 
     axis: the index of the axis, 0, 1 or 2.
     node: one of `_NODES`.
@@ -154,6 +157,7 @@ def _stencil_samples(
     """
     for axis in range(3):
         for node, weight, wide in zip(_NODES, _WEIGHTS, _WIDE_WEIGHTS, strict=True):
+            # (0 * points: a row for each point.)
             direction = np.sign(node) * np.eye(3)[axis] + 0 * points
             length = np.abs(node) * h
             node_samples = sample_field(field, points + length[:, None] * direction)
@@ -292,6 +296,7 @@ def _limits(
     magnitude = np.abs(samples.value) + (field.period or 0)
     # Rounding errors of values and coordinates, divided by the spacing.
     tolerance = 1e-6 * length + (1e-12 * magnitude + 1e-12 * length * _max_coordinates(points)) / h
+    # The difference of both tells the leading error of the first (Richardson extrapolation).
     fine, wide = _difference(nodes)
     tolerance += _RICHARDSON_FRACTION * np.linalg.norm(fine - wide, axis=1)
     if not any(promise.implies_smooth for promise in samples.promises):

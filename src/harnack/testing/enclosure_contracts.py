@@ -79,6 +79,7 @@ class PromiseCase:
         promise: Any = self.promise
         # Without the allowance for rounding, so that steps can be compared exactly.
         if isinstance(promise, HarmonicBall) and issubclass(kind, HarmonicBallEnclosure):
+            # How far the range goes below and above f(p) = 0.
             ends = -promise.lower, promise.upper
             below, above = (None if _is_infinite(end) else end for end in ends)
             if not kind.applies_to(promise.dimension, below is not None, above is not None):
@@ -312,7 +313,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
     latitudes, weights = rng.uniform(-1, 1, (rows, 3)), rng.dirichlet([0.7] * 3, rows)
     # The Poisson integral of the mass is at least mass (1-q^2)/8, and a potential is at most
     # (1-q^2)/6 times the largest density: so f stays above its lower end if the densities stay
-    # below 0.75 of the mass.
+    # below 0.75 of the mass. (Below, four of at most 0.18 are added, or a wave of 0.7 is alone.)
     centers = rng.uniform(-0.9, 0.9, (rows, 2))
     sizes = (1 - np.abs(centers)) * rng.uniform(0.1, 1, (rows, 2))
     density = rng.uniform(-0.18, 0.18, (rows, 4)) * 10 ** rng.uniform(-3, 0, (rows, 1))
@@ -352,6 +353,7 @@ def _bounded_laplacian(rng: np.random.Generator, rows: int, *, mirrored: bool) -
         return sign * (u.movement(t) - balls.movement(q, constant_density) + wave_part)
 
     # On a slightly smaller ball, the Poisson integrals of point masses are bounded as well.
+    # The end on the other side is practically infinite.
     near_end, far_end = mass - potential, 1e18 * mass
     below, above = (far_end, near_end) if mirrored else (near_end, far_end)
     lower, upper = np.sort(sign * np.stack([min_density, max_density]) / radius**2, axis=0)
@@ -568,9 +570,9 @@ def _value_scale(trial: RandomFunctions) -> FloatArray:
     """For each function of the trial, the size (rows,) of the numbers in its evaluation. The
     rounding errors of its values are proportional to it."""
     promise, size = trial.case.promise, np.abs(trial.slope) * trial.reach
-    for low, high in promise.interval_pairs[
-        :1
-    ]:  # the nearer end, as the other may be practically infinite
+    # The range of f is the first pair, if there is one. Its nearer end counts, as the other may be
+    # practically infinite.
+    for low, high in promise.interval_pairs[:1]:
         size = size + np.minimum(np.abs(getattr(promise, low)), np.abs(getattr(promise, high)))
     return size
 

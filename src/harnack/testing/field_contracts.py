@@ -100,6 +100,7 @@ def check_ray_samples(
             field, points, directions if forwards else -directions, reach, gaps,
             enclosures=enclosures, precision=precision, forwards=forwards,
         )  # fmt: skip
+        # Free lengths may be longer than the rays, even infinite: they are tested up to twice that.
         lengths = np.minimum(steps, 2 * reach)[:, None] * np.linspace(0, 1, _SAMPLES)
         path = lift_along_rays(field, points, directions, lengths)
         # The rounding error of the compared values, and of the points in this precision.
@@ -268,6 +269,7 @@ def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> N
             return
         raise BrokenPromiseError("nothing is known: without a promise no step is possible")
     for promise in samples.promises:
+        # (An entry of `units` begins with the name of a number.)
         numbers = [vars(promise)[name] for name, *_ in promise.units]
         name = type(promise).__name__
         require(~np.isnan(numbers).any(axis=0), f"{name} has a NaN", points)

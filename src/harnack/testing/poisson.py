@@ -100,6 +100,7 @@ def _cap_series(q: FloatArray, b: FloatArray, dimension: int) -> FloatArray:
     p0, p1 = np.ones_like(s), s
     d0, d1 = np.zeros_like(s), np.ones_like(s)
     for degree in range(1, _TERMS + 1):
+        # c is the coefficient of q^degree.
         power = power * q
         k = 2 * degree + 1
         if dimension == 2:
@@ -168,6 +169,7 @@ class AxialFunctions:
         total = np.zeros_like(q)
         for j in range(self.latitudes_or_heights.shape[1]):
             position, weight = self.latitudes_or_heights[:, j, None], self.weights[:, j, None]
+            # "points": rings of mass. Otherwise caps.
             function = kernel_difference if self.measure == "points" else cap_movement
             total += weight * function(q, position, self.dimension)
         return total
@@ -176,8 +178,8 @@ class AxialFunctions:
 @dataclass(frozen=True)
 class GreenPotentials:
     """Potentials of balls of constant density inside of the unit ball of R^3, evaluated on an axis
-    through the centers of all balls; several balls per row. The potentials vanish on the unit
-    sphere.
+    through the centers of all balls; several balls per row. `centers` are their positions on the
+    axis, `sizes` their radii. The potentials vanish on the unit sphere.
 
     centers, sizes: (rows, k) the positions of the balls on the axis, and their radii; |center| +
         size <= 1.
@@ -204,7 +206,7 @@ class GreenPotentials:
             outside = distance > size
             value = np.where(outside, size**3 / (3 * distance), 0.5 * size**2 - y * y / 6)
             slope = np.where(outside, size**3 * y / (3 * distance**3), y / 3)
-        # Subtract the potential of the image.
+        # Subtract the potential of the ball's image in the unit sphere, so that it is 0 there.
         value, slope = value - size**3 / 3, slope - size**3 * y / 3
         return (density * value).sum(axis=1), (density * slope).sum(axis=1)
 

@@ -272,8 +272,9 @@ _DIFFERENCE_SPACING = 1e-3
 @dataclass(frozen=True)
 class _Candidates:
     """Pairs of points (p, y) at which a promise is tested: p is the point where the promise is
-    made, a bound of f on a ball about p; y is a point of the ball. The violation ratio of a pair is
-    the change of f from p to y relative to its bound; above 1 the promise is violated.
+    made, a bound of f on a ball about p; y = p + reach * w is a point of the ball, with the ball's
+    radius `reach` and |w| < 1. The violation ratio of a pair is the change of f from p to y
+    relative to its bound; above 1 the promise is violated.
 
     p: (n, 3) the first points.
     w: (n, 3) the second points are y = p + reach * w, with |w| < 1.
@@ -367,6 +368,7 @@ def search_violations(
         # Keep the best move of each pair if it is better than the pair itself.
         best, is_better = best.best_of(search.pairs(p + reach * point_shift, new_w))
         steps = np.where(is_better, np.minimum(_STEP_GROWTH * steps, 1), _STEP_SHRINKAGE * steps)
+        # A search whose steps have become tiny begins anew with large ones.
         steps = np.where(steps < _MIN_STEP, _FIRST_STEP, steps)
     is_violated = best.violation_ratio > 1 + _RATIO_TOLERANCE
     if is_violated.any():
@@ -383,7 +385,8 @@ def search_violations(
 class _ViolationSearch:
     """The search for pairs of points (p, y) that violate a promise: a bound of f that the field
     states, at each point p, for a ball about p; y is a point of the ball. The violation ratio of a
-    pair is the change of f from p to y relative to its bound.
+    pair is the change of f from p to y relative to its bound. The length `longest` takes the place
+    of an infinite radius.
 
     field: the field.
     promise_index: the index of the promise in `Sample.all_promises`.
