@@ -165,7 +165,7 @@ class Interval:
 
     def _times(self, constant: Interval) -> Interval:
         """The product with an interval of Python floats, whose signs are known while Dr.Jit records
-        code."""
+        code. The constant is not [0, 0], a case that `__mul__` has done already."""
         a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self

@@ -420,6 +420,7 @@ class _CellSearch:
                 break
             ids = np.flatnonzero(self._is_unproved())
             # Split the marked cells, unless no query needs it or there would be too many cells.
+            # (About five of a cell's eight children are expected to remain, four more than before.)
             is_split = to_numpy(marks)
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:

@@ -118,8 +118,9 @@ class BestCandidate:
     distance: its distance from the query.
     exclusion_radius: the radius of a ball about `point` that is proved to hold no surface point
         nearer to the query.
-    separation_factor: the surface point of a cell is taken to lead to `point` again, and is
-        skipped, if it is closer to `point` than this factor times the cell's `separation`.
+    separation_factor: no descent starts from the surface point of a cell that is closer to `point`
+        than this factor times three or four half edges of the cell (its `separation`): such a
+        descent is taken to end at `point` again.
     """
 
     point: Vec3
@@ -316,7 +317,7 @@ class CellTree:
         limit: a function of the state; boxes whose squared distance from x is above its result are
             skipped.
         may_contain: a function of the lower and the upper corner of a box that tells whether the
-            box is to be visited.
+            box is to be visited; by default every box is.
         """
         vector = self.tree.backend.Array3f
 

@@ -154,6 +154,7 @@ class ClosestPointDescent:
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
             # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
+            # (1: the whole step.)
             move, _ = self._tangential_step(x, state, real(1))
             step = -residual / lengths.safe_norm(state.gradient)
             first_step = dr.select(k == 0, dr.abs(step), first_step)
@@ -204,6 +205,7 @@ class ClosestPointDescent:
         sample = self.field.evaluate(y)
         residual, state = self._state_at(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
+        # The step along the surface is not made here, so its largest fraction (1) does not matter.
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm

@@ -581,10 +581,11 @@ class _QueryEvaluator:
         them that hold no point of the surface nearer to the query.
         """
 
-        def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """Return the first-order signed distance (level - f)/|grad f| of the level from the
-            point that lies at the distance lengths.x from b in the direction of p, as a tuple of
-            one."""
+        def distance_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
+            """Return the first-order signed distance (level - f)/|grad f| of the level from a
+            point, as a tuple of one. The point lies at the distance lengths.x from the point b of
+            the boundary curve, in the direction of the query p. (A length comes as a vector of
+            three equal components, since `in_batches` takes vectors only.)"""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
@@ -592,9 +593,9 @@ class _QueryEvaluator:
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
-            """Run Newton's method to the surface, from the point at the distance lengths.x from b
-            in the direction of p. Returns the surface point, as a tuple of one; NaN if it is on the
-            side of b away from p."""
+            """Run Newton's method to the surface, from the point at the distance lengths.x from the
+            point b of the boundary curve, in the direction of the query p. Returns the surface
+            point, as a tuple of one; NaN if it is on the side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
             is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
@@ -608,7 +609,7 @@ class _QueryEvaluator:
             return closest, free
         # Beside an edge of the surface f is the angle about the edge: so the first-order distance
         # of the level is the length of an arc around the edge.
-        (arc_length,) = in_batches(self.backend, arc_to_level, points, boundary, offsets)
+        (arc_length,) = in_batches(self.backend, distance_to_level, points, boundary, offsets)
         rows = np.flatnonzero(~(np.abs(arc_length) > _MAX_ARC_RADII * aside))
         start = points[rows]
         if len(rows):

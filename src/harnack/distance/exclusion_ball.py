@@ -64,6 +64,7 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
         # By the bounds of first and of second order: |x - y - w|^2 is at least d^2 + margin |w|^2.
         margin = 1 - 2 * d * first_order / gradient_norm
         if hessian is not None:
+            # (2: the degree of the Taylor polynomial.)
             second_order = taylor_remainder(sample, r, 2) / (r * r)
             # c r of the proof, a bound of |n . w|/|w|.
             max_slope = fmin(first_order, hessian.half_norm + second_order) * r / gradient_norm

@@ -317,10 +317,10 @@ class _ChordCondition:
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q) = g + 1 + (B^(1/K) - 1)/q, in a form that does not cancel near q = 0. B is
-        the chord of Poisson's kernel, at the mean m, times (1-q)^K; K is n - 1. In the code
-        (B - 1)/q is c - K, and root is B^(1/K); so (root - 1)/q follows from c without a difference
-        of large numbers."""
+        """Return k(q) = g + 1 + (B^(1/K) - 1)/q, in a form that does not cancel near q = 0. The
+        condition is q k(q) <= g, where g is `gap`. B is the chord of Poisson's kernel, at the mean
+        m, times (1-q)^K; K is n - 1. In the code (B - 1)/q is c - K, and root is B^(1/K); so (root
+        - 1)/q follows from c without a difference of large numbers."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -328,11 +328,13 @@ class _ChordCondition:
             c = dr.fma(q * (5 - s) + m * (3 + s), r * r, q)  # (B - 1)/q + 2
             root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
             inverse = 1 / (root + 1)
+            # By root - 1 = q (c - 2)/(root + 1).
             return self.gap + inverse * (c + q * (c - 2) * inverse)
         a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
         c = dr.fma(a, r * r * r, q * (3 - q))  # (B - 1)/q + 3
         root = dr.cbrt(fmax(dr.fma(q, c - 3, 1), 0))
         inverse = 1 / dr.fma(root, root + 1, 1)
+        # By root - 1 = q (c - 3)/(root^2 + root + 1).
         return self.gap + inverse * (c + q * (c - 3) * inverse * (root + 2))
 
 
@@ -363,8 +365,8 @@ class _JensenCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q) = (1-g) (D^(n/2) - 1 + q^2)/q + g q with D = 1 + q^2 - 2 q m, in a form that
-        does not cancel near q = 0. In the code d is D, e is (D - 1)/q, x is the root of D, and
-        `rise` is (D^(n/2) - 1 + q^2)/q."""
+        does not cancel near q = 0. The condition is q k(q) <= g, where g is `gap`. In the code d is
+        D, e is (D - 1)/q, x is the root of D, and `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
         if self.dimension == 2:
@@ -515,9 +517,10 @@ class _CapCondition:
         return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q), in a form that does not cancel near q = 0. For each of s1 and s2, s^2 = 1 +
-        q e with a number e, so s = 1 + q x with x = e/(s+1). In the code `total` is the sum of the
-        two numbers x, and `rise` is (S - 1 + q^2)/q."""
+        """Return k(q) = (1-g) (S - 1 + q^2)/q + g q, in a form that does not cancel near q = 0. The
+        condition is q k(q) <= g, where g is `gap`. For each of s1 and s2, s^2 = 1 + q e with a
+        number e, so s = 1 + q x with x = e/(s+1). In the code `total` is the sum of the two numbers
+        x, and `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))

@@ -175,7 +175,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             active=now.active & ~is_seen & (distance <= farthest),
         )
 
-    # The sample at the hit may show a side of the level. No interval is known yet (zeros).
+    # The sample at the hit may show a side of the level. No interval is known yet (zeros). In the
+    # order: distance, way, above, below, low, high, their slopes, searches, may_turn, sample_count,
+    # is_found, active.
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
         hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0),

@@ -232,22 +232,23 @@ class JumpTracer:
         passed: Mask,
         stopped: Mask,
     ) -> JumpTraceState:
-        """Return the state after an interval for rays that look for crossings of the level. A ray
-        that has crossed the level at a facet has passed this facet, and the caller may make it
-        active again.
+        """Return the state after an interval for rays that look for crossings of the level. Where a
+        ray has crossed the level at a facet, the returned state is behind this facet, but not
+        active; the caller may make it active again, to look for the next crossing.
 
         previous: the state before the interval.
         now: the march at the end of the interval.
-        ahead, last: facets that the ray crosses at the same point are merged into one crossing,
-            `ahead`, at the end of the interval; `last` is the last of them, from which the ray goes
-            on.
-        passed: mask of rays that have passed the facet without crossing the level.
+        ahead: the crossing of a facet at the end of the interval. It may stand for several facets
+            that the ray crosses at the same point, with the sum of their jumps.
+        last: the last of these facets, from which the ray goes on.
+        passed: mask of rays that go on behind the facet, as they did not cross the level there.
         stopped: mask of rays whose interval ends at a facet.
         """
         used_all_steps = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(
             used_all_steps, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status
         )
+        # Rays that crossed the level at the facet are behind it, too.
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
         # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
@@ -357,6 +358,7 @@ class JumpTracer:
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.jumps.next_crossing(self.path.origin, self.path.direction, behind, end, active)
+        # The field may return other arrays or Python numbers; all become arrays of this backend.
         is_valid = real(ahead.t) <= end
         is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(

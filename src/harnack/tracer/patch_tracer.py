@@ -101,6 +101,7 @@ class PatchTracer:
         """
         real, count = self.march.backend.Float, self.march.backend.UInt32
         return PatchTraceState(
+            # Before all entries, whose parameters are at least 0.
             enter=real(-1),
             box=count(NO_PATCH),
             t=real(self.end),

@@ -121,6 +121,7 @@ class PixelCones:
         march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
+        # A hit is a point at which the ray comes to the cover.
         is_hit = now.status == int(RayStatus.HIT)
         begin = dr.select(is_hit, now.proved_to, 0)
         gap = prepared.levels.offset_to_nearest(now.value)
@@ -175,8 +176,11 @@ class PixelCones:
         offset = value - level
         if period is not None:
             offset = dr.fma(dr.round(offset / period), -period, offset)
+        # The height as a difference of f, which is divided by `radius` below.
         height = side * offset
         if self.solid is not None:
+            # Outside of the solid f is below `low` or above `high`: one of the differences is
+            # positive, and counts. `side` tells whether the height rises with f.
             low, high = self.solid
             height = fmax(low - value, value - high)
             side = dr.select(low - value > value - high, -1, type(value)(1))
