@@ -256,6 +256,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         """
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
         lowest = dr.select(passes(bottom), -1, plain.lower)
+        # (On lanes of `is_unknown` the range is [-1, 1].)
         return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
 
     return range_between(sine_lower, sine_upper, 0.25, 0.75), range_between(

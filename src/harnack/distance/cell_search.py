@@ -459,6 +459,8 @@ class _CellSearch:
             next descents; and 1 where Newton's method did not converge, else 0.
 
             guess_point: the best point before, NaN for none.
+
+            The trees `coarse` and `tree`, and `marks`, are the parameters of `_search_in_kernel`.
             """
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)

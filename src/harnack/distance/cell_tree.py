@@ -240,6 +240,8 @@ class CellTree:
 
             row: the cell's record.
             state: the lower bound so far, then the list of candidates.
+
+            x, best, points, tolerance and marks are the parameters of `closer_candidates`.
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
@@ -256,6 +258,7 @@ class CellTree:
             # distance.
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
+            # (1: at least the cell's separation away.)
             for other in points:
                 is_listed &= cell.is_separated(other, 1.0)
             estimate = dr.select(is_listed, estimate, dr.inf)
@@ -276,6 +279,7 @@ class CellTree:
             listed, point = [*state], cell.surface_point
             for k in range(0, len(listed), 2):
                 old, y = listed[k], listed[k + 1]
+                # (1: apart by at least the cell's separation.)
                 is_nearer, is_apart = estimate < old, cell.is_separated(y, 1.0)
                 listed[k] = dr.select(is_nearer, estimate, old)
                 listed[k + 1] = dr.select(is_nearer, point, y)

@@ -491,6 +491,7 @@ class _QueryEvaluator:
 
         def compute(p: Vec3, guess_point: Vec3) -> tuple[Vec3]:
             distance = safe_norm(guess_point - p)
+            # The first result is the point; a missing guess sets no limit.
             return (search.closest(p, dr.select(dr.isnan(distance), dr.inf, distance))[0],)
 
         (closest,) = in_batches(self._tracer.backend, compute, points, guess)
@@ -559,6 +560,7 @@ class _QueryEvaluator:
         if clip is not None and len(ids):
 
             def to_clip_curve(p: Vec3, y: Vec3) -> tuple[Vec3]:
+                # Without the curvature of the curve, the second result.
                 return (clip.closest(p, y)[0],)
 
             (clipped,) = in_batches(self.backend, to_clip_curve, points[ids], start[ids])

@@ -106,7 +106,9 @@ class JumpSurfaceSearch:
 
         def body(*state: Any) -> tuple[Any, ...]:
             """Trace one probe, a short ray through the nearest point of a facet, and choose the
-            next probe or facet. Returns the new state.
+            next probe or facet. Returns the new state. `next_facet` finds the facets in order,
+            `length` is half the length of the ray along the normal, and `max_count` the largest
+            number of facets.
 
             state: the attributes of the facet; the index of the probe (0 for the ray along the
                 normal, 1 to 6 for the edges of the tetrahedron); the surface point found; the

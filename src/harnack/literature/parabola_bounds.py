@@ -782,6 +782,7 @@ def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
         number 0."""
         if _is_zero(y):
             return x
+        # (0.0: no size besides that of the sum. The rounding of x and y is in them already.)
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
 
     return plus(first[0], second[0]), plus(first[1], second[1])

@@ -616,10 +616,12 @@ def refine_crossing(
         is_near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
-        # The half in which f changes sides.
+        # The half in which f changes sides. (`side` is 1 if f is larger before the crossing, else
+        # -1.)
         is_before = side * offset > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
+        # The interval may become as short as rounding.
         goes_on = ~is_near & (behind - before > smallest * size)
         # If the cubic's root is good, its gradient stays.
         is_good_root = is_near & (now.sample_count == 0)

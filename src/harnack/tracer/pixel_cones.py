@@ -131,6 +131,7 @@ class PixelCones:
         def sample_at(t: Real) -> tuple[Real, Real]:
             """Return the height over the surface at parameters t, in radii of the cone, and its
             derivative along the ray."""
+            # With the accuracy at which the march has ended.
             field, accuracy = prepared.field, prepared.field.variable_accuracy
             if accuracy is not None and now.accuracy_scale is not None:
                 field = accuracy.at(now.accuracy_scale)
