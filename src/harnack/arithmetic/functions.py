@@ -423,6 +423,7 @@ def power(n: float) -> ElementaryFunction:
             def inverse(x: Interval) -> DerivativeRanges:
                 """The ranges of x^n and of its first two derivatives on the interval x, for a
                 negative integer n = k. They are powers of 1/x."""
+                # n x^(n-1) and n (n-1) x^(n-2).
                 reciprocal_range = x.reciprocal()
                 slope = Interval.enclosing(k, type(x.lower)) * integer_power(
                     reciprocal_range, 1 - k
@@ -446,6 +447,7 @@ def power(n: float) -> ElementaryFunction:
             """The ranges of x^n and of its first two derivatives on the interval x, for an integer
             n >= 0."""
             number_type = cast("Any", type(x.lower))
+            # The factors n and n (n-1) of the derivatives.
             slope, second = (
                 Interval.enclosing(k, number_type),
                 Interval.enclosing(k * (k - 1), number_type),

@@ -329,6 +329,7 @@ class CellTree:
             """Return a mask and the new state. The mask tells where the traversal enters the node:
             where its box is near enough. If the node is a leaf, its cells are visited, which
             changes the state."""
+            # The corners of the node's box, and the vector between x and the box (0 inside).
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
             is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)

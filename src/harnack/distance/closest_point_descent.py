@@ -544,6 +544,8 @@ class ClosestPointDescent:
             along_u, along_v: the derivatives of the gradient along u and v; in them the terms of
                 the nodes before k are summed.
             """
+            # Nodes 0 and 1 are along u, 2 and 3 along v; odd nodes have the step -h, so that their
+            # terms are subtracted.
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
             term = gradient * (0.5 / step)

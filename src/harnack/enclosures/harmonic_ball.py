@@ -159,6 +159,7 @@ def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
     for _ in range(4):
         h = gap - q * (u + v * (3 + 3 * q + q * q))
         q = q + fmin(h, 0) / (u + 3 * v * (1 + q) * (1 + q))
+    # h at the end of the iteration, and the zero of the chord.
     h = fmin(gap - q * (u + v * (3 + 3 * q + q * q)), 0)
     return q * gap / (gap - h)
 
@@ -369,6 +370,7 @@ class _JensenCondition:
         D, e is (D - 1)/q, x is the root of D, and `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
+        # (D^(n/2) - 1)/q is e, e (D + x + 1)/(x + 1) and e (D + 1) for n = 2, 3 and 4.
         if self.dimension == 2:
             rise = q + e
         elif self.dimension == 4:

@@ -202,6 +202,8 @@ class AffineForm(FormulaNumber):
         of a direction c near the middle of z's range, plus the angle of z relative to c
         (`relative_angle`). Where that is not proved, only [-pi, pi] is known.
         """
+        # c = (a, b). The range of its angle is as narrow as rounding: its middle belongs to the
+        # center, its radius to the error.
         relative, is_valid, a, b = relative_angle(self, x, self.center, x.center)
         c_angle, _ = angle_range(Interval.point(b), Interval.point(a))
         center = relative.center + c_angle.midpoint
@@ -211,7 +213,7 @@ class AffineForm(FormulaNumber):
             + _rounding_bound(dr.abs(center) + dr.abs(c_angle.midpoint))
         )
         is_valid &= dr.isfinite(center) & dr.isfinite(relative.slope) & dr.isfinite(error)
-        half_turn = math.pi * (1 + 1e-6)
+        half_turn = math.pi * (1 + 1e-6)  # above pi in every precision
         return AffineForm(
             dr.select(is_valid, center, 0),
             dr.select(is_valid, relative.slope, 0),

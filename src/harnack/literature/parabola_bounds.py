@@ -237,8 +237,10 @@ class ParabolaBounds(FormulaNumber):
         highs: list[Real] = []
         for a, _ in self.bounds:
             for c, _ in other.bounds:
+                # The factor of s is `linear` at s = 0 and `linear` + `quadratic` at s = h.
                 linear, quadratic = v * c + w * a, a * c * h
                 rounding = _rounding_bound(dr.abs(v * c) + dr.abs(w * a) + dr.abs(quadratic))
+                # v and w may be off by their radii.
                 rounding += rv * dr.abs(c) + rw * dr.abs(a)
                 lows += [linear - rounding, linear + quadratic - rounding]
                 highs += [linear + rounding, linear + quadratic + rounding]
@@ -765,6 +767,8 @@ def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
+    # The largest value is at 0, at the end, or at the vertex if the parabola rises to it and then
+    # falls on the way: there it is -a^2/(4b).
     end_value = length * (a + b * length)
     end_value = end_value + _rounding_bound(length * (dr.abs(a) + dr.abs(b) * length))
     has_vertex = (b < 0) & (a > 0) & (a + 2 * b * length < 0)

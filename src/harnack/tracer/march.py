@@ -936,6 +936,7 @@ class March:
         slope = ray_sample.slope
         slope_size, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
         if is_smooth:
+            # Times the sign of the slope: positive towards the level.
             second_derivative = dr.mulsign(self._second_derivative(ray_sample, now, path), slope)
             discriminant = dr.fma(slope_size, slope_size, 2 * second_derivative * gap)
             target = _TRIAL_AIM * dr.select(

@@ -233,12 +233,16 @@ def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real
     sqrt(slope^2 + 2 r second_derivative)). Steps lead a little beyond these points.
     """
     real = cast("Any", type(height))
+    # Where the height falls: to a radius behind the surface, and to where the slope becomes 0.
+    # (`_NEGLIGIBLE` avoids divisions by 0.)
     length_to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
     length_to_lowest = dr.select(
         second_derivative > _NEGLIGIBLE,
         (1 + _AIM_MARGIN) * -slope / fmax(second_derivative, real(_NEGLIGIBLE)),
         dr.inf,
     )
+    # Where it rises: the rest of the height, and the slope at its end. A path that bends down counts
+    # as straight.
     rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
     end_slope = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
     length_to_outside = 2 * rest / fmax(slope + end_slope, real(_NEGLIGIBLE))

@@ -218,7 +218,7 @@ def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
         return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
-    is_held: Mask = value < value
+    is_held: Mask = value < value  # false everywhere
     for level in levels.values:
         is_held |= (low <= level) & (high >= level)
     return is_held
