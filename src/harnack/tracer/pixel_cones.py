@@ -241,8 +241,8 @@ def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real
         (1 + _AIM_MARGIN) * -slope / fmax(second_derivative, real(_NEGLIGIBLE)),
         dr.inf,
     )
-    # Where it rises: the rest of the height, and the slope at its end. A path that bends down counts
-    # as straight.
+    # Where it rises: the rest of the height, and the slope at its end. If the rise slows down, the
+    # slope counts as constant.
     rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
     end_slope = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
     length_to_outside = 2 * rest / fmax(slope + end_slope, real(_NEGLIGIBLE))
