@@ -511,7 +511,7 @@ class CellClassifier:
             # No plane is known to approximate the surface: the radius is 0.
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
         point = self._newton_point(p, radius)
-        is_found = point.x < 0.5 * FAR_SENTINEL
+        is_found = point.x < 0.5 * FAR_SENTINEL  # a missing point is at `FAR_SENTINEL`
         y = dr.select(is_found, point, p)
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)

@@ -86,6 +86,8 @@ class SurfaceCells:
         """
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
+        # After center and half: surface_point, normal, offset, thickness, plane_radius, curvature,
+        # clip_point and clip_curvature, each an array of its own.
         return cls(
             center, half, far, np.zeros((n, 3)), zero, np.full(n, FAR_SENTINEL), zero.copy(),
             np.full(n, FAR_SENTINEL), far.copy(), zero.copy(),
@@ -403,6 +405,7 @@ class _CellRecord:
         height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
         lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
         distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))
+        # (A missing point is at `FAR_SENTINEL`.)
         return dr.select(
             self.surface_point.x < 0.5 * FAR_SENTINEL, fmax(distance, self.lower_bound(x)), dr.inf
         )

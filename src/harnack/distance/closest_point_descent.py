@@ -346,8 +346,8 @@ class ClosestPointDescent:
 
         sample: the sample of f at y.
 
-        f counts as smooth on the largest ball about y on which the sample's promises (proved bounds
-        of f near y) imply that; everywhere if none of them implies it.
+        f counts as smooth on the largest ball of finite radius about y on which one of the sample's
+        promises (proved bounds of f near y) implies that; everywhere if there is no such ball.
         """
         real = self.backend.Float
         scale = lengths.max_norm(y)
@@ -360,12 +360,12 @@ class ClosestPointDescent:
         for promise in sample.all_promises:
             if not promise.implies_smooth:
                 continue
-            # A radius that is not finite sets no limit to steps.
+            # A radius that is not finite is left out.
             promised_radius = real(promise.radius)
             smooth_radius = fmax(
                 smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
             )
-        # No promise of smoothness: steps have no limit.
+        # No such ball: steps have no limit.
         smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
         return residual, _DescentState(

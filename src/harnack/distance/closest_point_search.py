@@ -426,6 +426,7 @@ class _QueryEvaluator:
         # 1e-12 allows for rounding; `not <=` is True for NaN.
         searched_rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
         # First the nearest triangle alone; where that is not on the surface, all facets in turn.
+        # (NaN stands for no point, also in place of the guess.)
         guess[searched_rows] = self._nearest_face_points(points[searched_rows])
         searched_rows = searched_rows[np.isnan(guess[searched_rows, 0])]
         if len(searched_rows):
@@ -601,6 +602,7 @@ class _QueryEvaluator:
             point, as a tuple of one; NaN if it is on the side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
+            # A little beyond a right angle still counts.
             is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
                 to_query
             ) * safe_norm(y - b)

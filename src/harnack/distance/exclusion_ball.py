@@ -107,6 +107,7 @@ class _HessianBounds:
         smallest = dr.select(dr.dot(to_query, plane.n) > 0, eigen.smallest, -eigen.largest)
         h_times_n = matvec(rows, plane.n)
         # The Frobenius norm is at least the spectral norm.
+        # (Below, the cross product with n has the length of the part of Hn at right angles to n.)
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(
             fmin(smallest, 0), safe_norm(dr.cross(h_times_n, plane.n)),

@@ -110,6 +110,7 @@ class LevelTriangles:
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p
+        # Each triangle has three vertices of its own.
         corners = self.corners
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
         tree = _tree(backend, corners.reshape(-1, 3), faces, slabs=True)

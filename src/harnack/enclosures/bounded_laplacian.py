@@ -249,6 +249,7 @@ class _GreenCondition:
         - 1)/q + 2, and root is sqrt(S)."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
+        # The first three terms of the left side are q inner/(1-q^2)^2.
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)
         inner = dr.fma(self.slope, 3 + s, inner)
         c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * p, p, 1))  # (S-1)/q + 2

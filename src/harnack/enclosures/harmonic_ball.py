@@ -264,7 +264,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             mean_upper = dr.select(u > 0, slopes.upper * scale, 0)
             mean_lower = dr.select(u > 0, slopes.lower * scale, 0)
             slack = condition_rounding(type(gaps.above))
-            # NaN for a slope counts as the worst one, on both sides.
+            # NaN for a slope counts as the worst one, on both sides. (Below, a gap toward 0 counts
+            # as at most u, since u stays positive.)
             m_max, m_min = fmax(fmin(mean_upper + slack, 1), -1), clamp(mean_lower - slack, -1, 1)
             conditions_away.append(
                 _ChordCondition.of(fmin(gap_away * inv_u, _UNREACHABLE_GAP), m_max, self.dimension)
@@ -529,5 +530,6 @@ class _CapCondition:
         s2 = dr.sqrt(dr.fma(one_plus_q, one_plus_q, -2 * q * (self.p - self.shift)))
         inverse = 1 / ((s1 + 1) * (s2 + 1))
         total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * inverse  # x1 + x2
+        # By S = s1 s2 (1 + q total/2) and s1 s2 = 1 + q total + q^2 x1 x2.
         rise = q * dr.fma(e1 * e2, inverse, 1) + total * dr.fma(0.5 * s1, s2, 1)
         return dr.fma(1 - self.gap, rise, self.gap * q)

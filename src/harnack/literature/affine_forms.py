@@ -175,6 +175,7 @@ class AffineForm(FormulaNumber):
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
         chord_slope = difference_range.upper / (difference_range.upper - difference_range.lower)
+        # The line lies in the middle between the chord and the chord lowered by `excess`.
         excess = -difference_range.lower * chord_slope
         center = chord_slope * (difference.center - difference_range.lower) - 0.5 * excess
         size = dr.abs(chord_slope) * (

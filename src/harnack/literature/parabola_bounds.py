@@ -613,6 +613,7 @@ class ParabolaBounds(FormulaNumber):
         slope -value/length is enough for all s >= end. Likewise slope -value/end is small enough to
         be below -value for all s >= end.
         """
+        # (Factors a little above 1 allow for rounding.)
         (low_slope, _), (high_slope, _) = self.bounds
         length_fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
         slope_behind = -(value.lower / length)
@@ -650,6 +651,7 @@ def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real,
     both. If rounding mistakes the sign of a second derivative, that derivative is as small as its
     rounding error.
     """
+    # (NaN or infinite for c3 = 0: then it is outside.)
     t = -c2 / (3 * c3)
     is_divided = (t > 0) & (t < 1)
     t = dr.select(is_divided, t, 1)
