@@ -156,8 +156,8 @@ class Interval:
         low = high = end_products[0]
         for product in end_products[1:]:
             low, high = _minimum(low, product), _maximum(high, product)
-        # On lanes where a product is NaN (0 times infinity), the result is all numbers. (The mask is
-        # never None.)
+        # On lanes where a product is NaN (0 times infinity), the result is all numbers. (The mask
+        # is never None.)
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)

@@ -70,7 +70,7 @@ class RecordTable:
         missing_rows = iterations * at_once - len(table)
         if missing_rows and padding_row is None:
             raise ValueError(
-                f"{len(table)} records make no whole trips of {at_once}: give `filling`"
+                f"{len(table)} records are no multiple of at_once={at_once}: give `padding_row`"
             )
         if padding_row is not None:
             table = np.concatenate([table, np.tile(padding_row, (missing_rows, 1))])
