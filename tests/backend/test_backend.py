@@ -592,6 +592,6 @@ except AttributeError as error:
 
 
 def test_records_that_fill_no_whole_iteration_need_a_padding_row() -> None:
-    with pytest.raises(ValueError) as caught:
+    message = "3 records are no multiple of at_once=2: give `padding_row`"
+    with pytest.raises(ValueError, match=f"^{message}$"):
         RecordTable.upload(hb.choose_backend(), np.zeros((3, 2)), at_once=2)
-    assert str(caught.value) == "3 records are no multiple of at_once=2: give `padding_row`"

@@ -408,7 +408,7 @@ def _power_by_squaring(x: Real, n: int) -> Real:
     while n:
         if n & 1:
             result = x if result is None else result * x
-        x = x * x if n > 1 else x
+        x = x * x if n > 1 else x  # (the last square is not needed, and might overflow)
         n >>= 1
     return result
 

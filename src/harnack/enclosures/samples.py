@@ -98,7 +98,7 @@ class Sample:
     def select(self, mask: Mask, other: Sample) -> Sample:
         """The sample `other` on the lanes on which the mask is true, and this sample on all other
         lanes. Both samples must have promises of the same kinds in the same order. The result has
-        no shading normal."""
+        no shading normal, and the mask `branch_unknown` of this sample."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
