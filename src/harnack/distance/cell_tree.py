@@ -383,12 +383,15 @@ class _CellRecord:
         of two distances from x: to the cell's box, and to the part of its slab in the ball around
         the cell."""
         vector = cast("Any", type(x))
-        offset = x - self.center
-        box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
-        height = dr.dot(offset, self.normal)
-        in_plane_distance = dr.norm(dr.fma(vector(-height), self.normal, offset))
+        from_center = x - self.center
+        box_distance = dr.norm(
+            vector(*(fmax(dr.abs(from_center[k]) - self.half, 0) for k in range(3)))
+        )
+        height = dr.dot(from_center, self.normal)
+        in_plane_distance = dr.norm(dr.fma(vector(-height), self.normal, from_center))
         normal_gap = fmax(dr.abs(height - self.offset) - self.thickness, 0)
-        # The ball has the radius sqrt(3) half.
+        # (A cell without a slab has a huge thickness, so that this gap is 0.) The ball has the
+        # radius sqrt(3) half.
         in_plane_gap = fmax(in_plane_distance - 1.7321 * self.half, 0)
         return fmax(box_distance, dr.norm(vector(normal_gap, in_plane_gap, 0)))
 
@@ -400,10 +403,10 @@ class _CellRecord:
         line. The vector from x to the closest point of the plane or line is at right angles to the
         vector from there to the surface point: so the distance follows by Pythagoras.
         """
-        offset = x - self.surface_point
+        from_point = x - self.surface_point
         # A point of the clip curve has no plane.
-        height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
-        lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
+        height = dr.select(self.is_cell, dr.dot(from_point, self.normal), 0)
+        lateral_square = dr.squared_norm(from_point) - height * height - self.spread * self.spread
         distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))
         # (A missing point is at `FAR_SENTINEL`.)
         return dr.select(

@@ -440,21 +440,21 @@ class _QueryEvaluator:
 
         points: (n, 3) the queries.
         """
-        jumps, surface = self._tracer.field.jumps, self._tracer
+        jumps, tracer = self._tracer.field.jumps, self._tracer
         mesh = jumps.mesh()
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
             return closest
-        real, index = surface.backend.Float, surface.backend.UInt32
+        real, index = tracer.backend.Float, tracer.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
             """Return the point of a facet that is nearest to p, the index of the facet, and the
             facet's normal at the point."""
-            no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
+            no_key, always = (real(-1), index(NO_FACET)), tracer.backend.Bool(True)
             facet = jumps.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
 
-        y, facet_id, normal = in_batches(surface.backend, nearest, points)
+        y, facet_id, normal = in_batches(tracer.backend, nearest, points)
         # `mesh` holds the vertices and the faces.
         corners = mesh[0][mesh[1][facet_id.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)

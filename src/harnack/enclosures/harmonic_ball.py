@@ -515,9 +515,9 @@ class _CapCondition:
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
         """Return k(0) and k'(0)."""
-        x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
+        x, y, weight = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
         second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
-        return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
+        return 3 * weight * self.shift, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
         """Return k(q) = (1-g) (S - 1 + q^2)/q + g q, in a form that does not cancel near q = 0. The

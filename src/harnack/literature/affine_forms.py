@@ -153,17 +153,17 @@ class AffineForm(FormulaNumber):
             value.radius + _rounding_bound(dr.abs(value.midpoint)),
         )
         best = _smaller_error(_smaller_error(chord, mean_slope_line), constant_line)
-        center, best_slope, error = best
+        best_center, best_slope, best_error = best
         # The line as a function of e, by f = self.center + self.slope e + r.
         shift = best_slope * (self.center - middle)
         rounding = _rounding_bound(
-            dr.abs(center)
+            dr.abs(best_center)
             + dr.abs(best_slope) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + shift,
+            best_center + shift,
             best_slope * self.slope,
-            error + dr.abs(best_slope) * self.error + rounding,
+            best_error + dr.abs(best_slope) * self.error + rounding,
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:

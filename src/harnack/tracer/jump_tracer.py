@@ -150,10 +150,10 @@ class JumpTracer:
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
         offset = real(self.jumps.initial_offset(o, d, before, state.active))
         # The place from which facets are looked for: no facet, no jump, no normal.
-        start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
+        no_crossing = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
         # Only rays that look for crossings of the level have a contact.
         reported = None if state.contact is None else count(NO_FACET)
-        return JumpTraceState(offset, start, state, reported)
+        return JumpTraceState(offset, no_crossing, state, reported)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
         """Return the end state of rays as a `MarchState`, and the index of the facet that each ray
@@ -326,7 +326,7 @@ class JumpTracer:
             )
 
         no_facet = count(NO_FACET)
-        start = _CoincidentJumps(
+        initial = _CoincidentJumps(
             jump=first.jump,
             t=first.t,
             last=first.facet,
@@ -337,7 +337,7 @@ class JumpTracer:
             folded=self.backend.Bool(False),
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
-        total = loop_while_active(start, add_next, "together")
+        total = loop_while_active(initial, add_next, "together")
         # The first facet whose jump has the sign of the sum gives index and normal.
         rises, falls = total.jump > 0, total.jump < 0
         facet = dr.select(rises, total.up, dr.select(falls, total.down, first.facet))

@@ -429,8 +429,10 @@ class March:
         """
         if self.hysteresis is None or now.contact is None:
             return accepted, now.proved_step
-        tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
-        band_reaches = self.hysteresis.may_reach(now.contact, trial.band, now.trial_step, tolerance)
+        tolerance_length = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
+        band_reaches = self.hysteresis.may_reach(
+            now.contact, trial.band, now.trial_step, tolerance_length
+        )
         band_reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
         shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
         fallback = dr.select(band_reaches | too_coarse, now.proved_step, shorter)
@@ -593,10 +595,10 @@ class March:
         `HitTolerance.value` always counts.
         """
         sample, p = ray_sample.sample, path.point(t)
-        tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+        tolerance_length = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         # A bound of the rounding of the point.
         slack = 8 * self.backend.machine_epsilon * size
-        reach = fmax(tolerance, 2 * slack)
+        reach = fmax(tolerance_length, 2 * slack)
         is_proved = gaps.nearest <= self.tolerance.value
         # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:

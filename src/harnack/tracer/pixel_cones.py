@@ -177,7 +177,7 @@ class PixelCones:
         offset = value - level
         if period is not None:
             offset = dr.fma(dr.round(offset / period), -period, offset)
-        # The height as a difference of f, which is divided by `radius` below.
+        # The height as a difference of f, which is divided by `radius_in_value` below.
         height = side * offset
         if self.solid is not None:
             # Outside of the solid f is below `low` or above `high`: one of the differences is
@@ -186,10 +186,10 @@ class PixelCones:
             height = fmax(low - value, value - high)
             side = dr.select(low - value > value - high, -1, type(value)(1))
         # The radius of the cone, as a difference of f.
-        radius = safe_norm(gradient) * self.radius * t
-        has_slope = radius > 0
-        slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius, 0)
-        return dr.select(has_slope, height / radius, dr.inf), slope
+        radius_in_value = safe_norm(gradient) * self.radius * t
+        has_slope = radius_in_value > 0
+        slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius_in_value, 0)
+        return dr.select(has_slope, height / radius_in_value, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
         """Return the interval (start, end) of ray parameters on which the cones can touch the
