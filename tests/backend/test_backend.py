@@ -23,6 +23,7 @@ from rich.console import Console
 import harnack.backend as hb
 from harnack.backend import arrays, doctor, llvm
 from harnack.backend.elementary import orthonormal_basis, orthonormal_basis_rows
+from harnack.backend.record_table import RecordTable
 from harnack.rendering.mitsuba import load_mitsuba
 
 ELF_WITH_SONAME = b"\x7fELF...\0libc.so.6\0%s\0LLVMCreateMessage\0"
@@ -588,3 +589,9 @@ except AttributeError as error:
     rooms, missed = run.stdout.splitlines()
     assert rooms == "['_version', 'backend', 'name_suggestions']"
     assert missed == "module 'harnack' has no attribute 'traec'; did you mean \"trace\"?"
+
+
+def test_records_that_fill_no_whole_iteration_need_a_padding_row() -> None:
+    message = "3 records are no multiple of at_once=2: give `padding_row`"
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        RecordTable.upload(hb.choose_backend(), np.zeros((3, 2)), at_once=2)

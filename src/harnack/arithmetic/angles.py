@@ -93,6 +93,7 @@ def angle_range(y: Interval, x: Interval) -> tuple[Interval, Mask]:
 def _largest_angle(y: Interval, x: Interval) -> Real:
     """The largest polar angle on the box of all points (x, y), if the box does not meet the cut. It
     is the angle of a corner (`angle_range`)."""
+    # The angle falls with x where y > 0, and rises with y where x > 0.
     corner_x = dr.select(y.upper > 0, x.lower, x.upper)
     corner_y = dr.select(corner_x > 0, y.upper, y.lower)
     # At an infinite corner the angle is that of the axis on which it lies.

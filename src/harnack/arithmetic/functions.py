@@ -256,6 +256,7 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         """
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
         lowest = dr.select(passes(bottom), -1, plain.lower)
+        # (On lanes of `is_unknown` the range is [-1, 1].)
         return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
 
     return range_between(sine_lower, sine_upper, 0.25, 0.75), range_between(
@@ -407,7 +408,7 @@ def _power_by_squaring(x: Real, n: int) -> Real:
     while n:
         if n & 1:
             result = x if result is None else result * x
-        x = x * x if n > 1 else x
+        x = x * x if n > 1 else x  # (the last square is not needed, and might overflow)
         n >>= 1
     return result
 
@@ -422,6 +423,7 @@ def power(n: float) -> ElementaryFunction:
             def inverse(x: Interval) -> DerivativeRanges:
                 """The ranges of x^n and of its first two derivatives on the interval x, for a
                 negative integer n = k. They are powers of 1/x."""
+                # n x^(n-1) and n (n-1) x^(n-2).
                 reciprocal_range = x.reciprocal()
                 slope = Interval.enclosing(k, type(x.lower)) * integer_power(
                     reciprocal_range, 1 - k
@@ -445,6 +447,7 @@ def power(n: float) -> ElementaryFunction:
             """The ranges of x^n and of its first two derivatives on the interval x, for an integer
             n >= 0."""
             number_type = cast("Any", type(x.lower))
+            # The factors n and n (n-1) of the derivatives.
             slope, second = (
                 Interval.enclosing(k, number_type),
                 Interval.enclosing(k * (k - 1), number_type),

@@ -156,7 +156,8 @@ class Interval:
         low = high = end_products[0]
         for product in end_products[1:]:
             low, high = _minimum(low, product), _maximum(high, product)
-        # On lanes where a product is NaN (0 times infinity), the result is all numbers.
+        # On lanes where a product is NaN (0 times infinity), the result is all numbers. (The mask
+        # is never None.)
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
@@ -165,7 +166,7 @@ class Interval:
 
     def _times(self, constant: Interval) -> Interval:
         """The product with an interval of Python floats, whose signs are known while Dr.Jit records
-        code."""
+        code. The constant is not [0, 0], a case that `__mul__` has done already."""
         a, b = cast("tuple[float, float]", (constant.lower, constant.upper))
         if a == b == 1.0:
             return self

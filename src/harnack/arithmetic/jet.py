@@ -65,6 +65,7 @@ class Jet(FormulaNumber):
 
         order: the highest order of derivatives, 1 or 2.
         """
+        # Six second derivatives; the first derivatives of coordinate k are 1 by itself, else 0.
         second = (ZERO,) * 6 if order > 1 else ()
         units = [tuple(ONE if i == k else ZERO for i in range(3)) for k in range(3)]
         zero = 0 * p.x

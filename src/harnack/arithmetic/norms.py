@@ -234,6 +234,7 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
     tiny = float(dr.smallest(cast("Any", type(largest))))
     # Divided by the largest, so that no power overflows.
     inverse_largest = Interval.point(fmax(tiny, largest)).reciprocal()
+    # Each gives three ranges; [0] is that of the function, without those of its derivatives.
     root_ranges, power_ranges = power(1 / p).ranges, power(p).ranges
     powers = [power_ranges(Interval.point(size) * inverse_largest)[0] for size in sizes]
     norm = root_ranges(_total(powers))[0] * Interval.point(largest)

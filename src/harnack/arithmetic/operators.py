@@ -428,6 +428,7 @@ class OperationCounter(FormulaNumber):
             n, size = float(exponent), max(self.size, 1.0)
             size, rate = _power(size, n), n * _power(size, n - 1) * self.rate
             return self._after(_FUNCTION, self, size, rate, is_square=n == 2.0)
+        # The size of another function is not known, and taken as 1.
         size = self.size if function is absolute else 1.0
         return self._bent(_FUNCTION, self, size, self.rate)
 
@@ -442,6 +443,7 @@ class OperationCounter(FormulaNumber):
         unless both numbers are constant."""
         if not (self.is_constant and x.is_constant):
             self.tally.may_jump = self.tally.is_steep = True
+        # An angle counts as of the size 1.
         return self._bent(_FUNCTION + _PRODUCT, x, 1.0, self.rate + x.rate)
 
     def norm_of_powers(self, p: float) -> OperationCounter:

@@ -317,6 +317,7 @@ def to_float(backend: Backend, values: Any, name: str = "values") -> Real:
         raise ValueError(f"{name} must be a number or have shape (n,), not {numbers.shape}")
     _check_rows(np.isnan(numbers), "NaN", name)
     rounded = _cast(backend, numbers, name)
+    # A single number.
     if rounded.ndim == 0:
         return dr.opaque(backend.Float, float(rounded))
     return upload_floats(backend, rounded)
@@ -347,6 +348,7 @@ def as_kernel_parameters(array: Any) -> Any:
         return kind(*map(as_kernel_parameters, array))
     if array.state != dr.VarState.Literal:
         return array
+    # A copy in memory; derivatives are attached again.
     parameter = dr.detach(kind(array))
     dr.make_opaque(parameter)
     return dr.replace_grad(parameter, array) if dr.grad_enabled(array) else parameter

@@ -58,6 +58,7 @@ def safe_norm(v: Vec3) -> Real:
     real = cast("Any", type(largest))
     (low, up), (high, down) = _norm_scaling_exponents(largest)
     is_short, is_long = largest < 2.0**low, largest > 2.0**high
+    # The power of 2 for each lane, and its inverse, by which the length is multiplied afterwards.
     scale = dr.select(is_short, real(2.0**up), dr.select(is_long, real(2.0**down), real(1)))
     inverse = dr.select(is_short, real(2.0**-up), dr.select(is_long, real(2.0**-down), real(1)))
     return dr.norm(v * scale) * inverse

@@ -66,16 +66,16 @@ class RecordTable:
         Raises:
             ValueError: padding_row is needed and is None.
         """
-        iterations = -(-len(table) // at_once)
+        iterations = -(-len(table) // at_once)  # rounded up
         missing_rows = iterations * at_once - len(table)
         if missing_rows and padding_row is None:
             raise ValueError(
-                f"{len(table)} records make no whole trips of {at_once}: give `filling`"
+                f"{len(table)} records are no multiple of at_once={at_once}: give `padding_row`"
             )
         if padding_row is not None:
             table = np.concatenate([table, np.tile(padding_row, (missing_rows, 1))])
         rows, width = table.shape
-        padded_width = -(-width // PACKET) * PACKET
+        padded_width = -(-width // PACKET) * PACKET  # a multiple of `PACKET`, rounded up
         unpadded = upload_floats(backend, np.ascontiguousarray(table).ravel())
         # Entry `position` of the padded table is row `row` and column `column`; columns beyond the
         # width are 0.

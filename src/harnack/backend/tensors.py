@@ -87,9 +87,11 @@ def array_to_tensor(array: Any, shape: tuple[int, ...]) -> Any:
     """
     kind = cast("Any", type(array))
     count = math.prod(shape)
+    # A value that all lanes share: entry 0 for all of them.
     if dr.width(array) == 1 and count > 1:
         index_type = dr.uint32_array_t(dr.array_t(kind))
         array = dr.gather(kind, array, dr.zeros(index_type, count))
+    # The numbers of a vector in one array, point after point.
     if dr.depth_v(kind) > 1:
         array, shape = dr.ravel(array), (*shape, dr.size_v(kind))
     elif dr.is_unsigned_v(kind) and not dr.is_mask_v(kind):

@@ -219,8 +219,9 @@ class ClipCurveDescent:
         depth = (
             -self.domain.signed_distance(y) - _DOMAIN_INSET * self.backend.machine_epsilon * scale
         )
-        # To first order, the distances to the level set along u, and along n to a surface just
-        # inside of the boundary, where points of the curve are placed.
+        # To first order, the distances to the level set along u (`offset`), and along n to a
+        # surface just inside of the boundary, where points of the curve are placed (`depth`).
+        # `near` is the rounding of the first.
         offset = self.levels.offset_to_nearest(sample.value) / gradient_norm
         near = dr.fma(
             _LEVEL_TOLERANCE * self.backend.machine_epsilon,
@@ -463,10 +464,11 @@ class CellClassifier:
             clearance = level_distance_lower_bound(
                 self._backend, self._field, self._levels, p, sample
             )
-        value, gradient_norm = (
-            -self._levels.offset_to_nearest(sample.value),
+        residual, gradient_norm = (
+            -self._levels.offset_to_nearest(sample.value),  # f - level
             safe_norm(sample.gradient),
         )
+        # The bound E of the proof, with the rounding of f.
         linear_error = taylor_remainder(
             sample, radius
         ) + 8 * self._backend.machine_epsilon * dr.abs(sample.value)
@@ -482,11 +484,11 @@ class CellClassifier:
             # f - level changes by at most |g| radius + error in the ball, so that no other level
             # (a period away) lies in it.
             is_slab &= dr.fma(gradient_norm, radius, linear_error) < self._levels.period - dr.abs(
-                value
+                residual
             )
         divisor = dr.select(is_slab, gradient_norm, 1)
         normal = dr.select(is_slab, sample.gradient / divisor, vector(0, 0, 0))
-        offset = dr.select(is_slab, -value / divisor, 0)
+        offset = dr.select(is_slab, -residual / divisor, 0)
         thickness = dr.select(is_slab, linear_error / divisor, FAR_SENTINEL)
         is_empty = (clearance > radius) | (is_slab & (dr.abs(offset) > radius + thickness))
         return dr.select(is_empty, real(1), 0), normal, offset, thickness
@@ -506,9 +508,10 @@ class CellClassifier:
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
         if self.surface.field.jumps is not None:
+            # No plane is known to approximate the surface: the radius is 0.
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
         point = self._newton_point(p, radius)
-        is_found = point.x < 0.5 * FAR_SENTINEL
+        is_found = point.x < 0.5 * FAR_SENTINEL  # a missing point is at `FAR_SENTINEL`
         y = dr.select(is_found, point, p)
         gradient = self._field.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
@@ -557,8 +560,8 @@ class CellClassifier:
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
-            """Make one Newton step from y. Returns the new y, the length of this step, and the new
-            number of steps.
+            """Make one Newton step from y, at most as long as `radius`. Returns the new y, the
+            length of this step, and the new number of steps.
 
             last: the length of the step before.
             k: the number of steps so far.
@@ -567,6 +570,7 @@ class CellClassifier:
             gradient_norm = safe_norm(sample.gradient)
             off_level = self._levels.offset_to_nearest(sample.value)
             newton_step = off_level / gradient_norm
+            # For the first six steps the root counts as simple.
             factor = dr.select(k >= _MAX_STEPS - 1, multiplicity(newton_step, last), 1)
             step = clamp(factor * newton_step, -radius, radius)
             goes_on = dr.isfinite(step) & (dr.norm(y - p) < 4 * radius)

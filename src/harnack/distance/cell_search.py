@@ -177,6 +177,7 @@ def search(
     """
     box = _bounding_box(surface)
     if box is not None:
+        # An empty box: there is no surface.
         if (box[0] > box[1]).any():
             return SearchResult(np.full_like(points, np.nan), np.full(len(points), np.inf))
         return _search_in_batches(
@@ -420,6 +421,7 @@ class _CellSearch:
                 break
             ids = np.flatnonzero(self._is_unproved())
             # Split the marked cells, unless no query needs it or there would be too many cells.
+            # (About five of a cell's eight children are expected to remain, four more than before.)
             is_split = to_numpy(marks)
             count = int(is_split.sum())
             if not count or not len(ids) or len(self.cells) + 4 * count > self.max_cells:
@@ -458,6 +460,8 @@ class _CellSearch:
             next descents; and 1 where Newton's method did not converge, else 0.
 
             guess_point: the best point before, NaN for none.
+
+            The trees `coarse` and `tree`, and `marks`, are the parameters of `_search_in_kernel`.
             """
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)
@@ -536,6 +540,7 @@ class _CellSearch:
         # `slice(None)`: of all queries.
         limit = upload_floats(self.backend, self._distance(slice(None)))
         start = to_numpy(tree.best_start(upload_vectors(self.backend, self.points), limit))
+        # Missing starts have coordinates of about `FAR_SENTINEL`.
         rows = np.flatnonzero(start[:, 0] < 0.5 * FAR_SENTINEL)
         self._descend(rows, start[rows])
         return start
@@ -567,6 +572,7 @@ class _CellSearch:
             # Queries without a further chance are left out of the next round.
             active = np.isin(rows, improved_ids)
             if self._is_expensive or self.classifier.surface.field.jumps is not None:
+                # Those that had a start. (A missing one is at `FAR_SENTINEL`.)
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
             # Only the last of the points tried before is kept, with those of this round.
             rows, tried = (
@@ -579,6 +585,7 @@ class _CellSearch:
         `starts`, (k, 3), with `FAR_SENTINEL` for none. Returns the queries of `rows` whose distance
         became smaller."""
         old_distance = self._distance(rows)
+        # All pairs of an array and a query with a start. (A missing one is at `FAR_SENTINEL`.)
         start_index, selected = np.nonzero([start[:, 0] < 0.5 * FAR_SENTINEL for start in starts])
         self._descend(rows[selected], np.stack(starts)[start_index, selected])
         return rows[self._distance(rows) < old_distance]

@@ -86,6 +86,8 @@ class SurfaceCells:
         """
         n = len(half)
         far, zero = np.full((n, 3), FAR_SENTINEL), np.zeros(n)
+        # After center and half: surface_point, normal, offset, thickness, plane_radius, curvature,
+        # clip_point and clip_curvature, each an array of its own.
         return cls(
             center, half, far, np.zeros((n, 3)), zero, np.full(n, FAR_SENTINEL), zero.copy(),
             np.full(n, FAR_SENTINEL), far.copy(), zero.copy(),
@@ -118,8 +120,9 @@ class BestCandidate:
     distance: its distance from the query.
     exclusion_radius: the radius of a ball about `point` that is proved to hold no surface point
         nearer to the query.
-    separation_factor: the surface point of a cell is taken to lead to `point` again, and is
-        skipped, if it is closer to `point` than this factor times the cell's `separation`.
+    separation_factor: no descent starts from the surface point of a cell that is closer to `point`
+        than this factor times three or four half edges of the cell (its `separation`): such a
+        descent is taken to end at `point` again.
     """
 
     point: Vec3
@@ -239,6 +242,8 @@ class CellTree:
 
             row: the cell's record.
             state: the lower bound so far, then the list of candidates.
+
+            x, best, points, tolerance and marks are the parameters of `closer_candidates`.
             """
             lower, *listed = state
             cell = _CellRecord.of(vector, row)
@@ -255,6 +260,7 @@ class CellTree:
             # distance.
             is_listed = is_open_cell & (estimate < best.distance + cell.estimate_slack)
             is_listed &= cell.is_separated(best.point, best.separation_factor)
+            # (1: at least the cell's separation away.)
             for other in points:
                 is_listed &= cell.is_separated(other, 1.0)
             estimate = dr.select(is_listed, estimate, dr.inf)
@@ -275,6 +281,7 @@ class CellTree:
             listed, point = [*state], cell.surface_point
             for k in range(0, len(listed), 2):
                 old, y = listed[k], listed[k + 1]
+                # (1: apart by at least the cell's separation.)
                 is_nearer, is_apart = estimate < old, cell.is_separated(y, 1.0)
                 listed[k] = dr.select(is_nearer, estimate, old)
                 listed[k + 1] = dr.select(is_nearer, point, y)
@@ -316,7 +323,7 @@ class CellTree:
         limit: a function of the state; boxes whose squared distance from x is above its result are
             skipped.
         may_contain: a function of the lower and the upper corner of a box that tells whether the
-            box is to be visited.
+            box is to be visited; by default every box is.
         """
         vector = self.tree.backend.Array3f
 
@@ -324,6 +331,7 @@ class CellTree:
             """Return a mask and the new state. The mask tells where the traversal enters the node:
             where its box is near enough. If the node is a leaf, its cells are visited, which
             changes the state."""
+            # The corners of the node's box, and the vector between x and the box (0 inside).
             low, high = vector(*node.head[:3]), vector(*node.head[3:6])
             offset = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
             is_near = (dr.squared_norm(offset) < limit(state)) & may_contain(low, high)
@@ -375,12 +383,15 @@ class _CellRecord:
         of two distances from x: to the cell's box, and to the part of its slab in the ball around
         the cell."""
         vector = cast("Any", type(x))
-        offset = x - self.center
-        box_distance = dr.norm(vector(*(fmax(dr.abs(offset[k]) - self.half, 0) for k in range(3))))
-        height = dr.dot(offset, self.normal)
-        in_plane_distance = dr.norm(dr.fma(vector(-height), self.normal, offset))
+        from_center = x - self.center
+        box_distance = dr.norm(
+            vector(*(fmax(dr.abs(from_center[k]) - self.half, 0) for k in range(3)))
+        )
+        height = dr.dot(from_center, self.normal)
+        in_plane_distance = dr.norm(dr.fma(vector(-height), self.normal, from_center))
         normal_gap = fmax(dr.abs(height - self.offset) - self.thickness, 0)
-        # The ball has the radius sqrt(3) half.
+        # (A cell without a slab has a huge thickness, so that this gap is 0.) The ball has the
+        # radius sqrt(3) half.
         in_plane_gap = fmax(in_plane_distance - 1.7321 * self.half, 0)
         return fmax(box_distance, dr.norm(vector(normal_gap, in_plane_gap, 0)))
 
@@ -392,11 +403,12 @@ class _CellRecord:
         line. The vector from x to the closest point of the plane or line is at right angles to the
         vector from there to the surface point: so the distance follows by Pythagoras.
         """
-        offset = x - self.surface_point
+        from_point = x - self.surface_point
         # A point of the clip curve has no plane.
-        height = dr.select(self.is_cell, dr.dot(offset, self.normal), 0)
-        lateral_square = dr.squared_norm(offset) - height * height - self.spread * self.spread
+        height = dr.select(self.is_cell, dr.dot(from_point, self.normal), 0)
+        lateral_square = dr.squared_norm(from_point) - height * height - self.spread * self.spread
         distance = dr.sqrt(dr.fma(height, height, fmax(lateral_square, 0)))
+        # (A missing point is at `FAR_SENTINEL`.)
         return dr.select(
             self.surface_point.x < 0.5 * FAR_SENTINEL, fmax(distance, self.lower_bound(x)), dr.inf
         )

@@ -154,6 +154,7 @@ class ClosestPointDescent:
             sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
             # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
+            # (1: the whole step.)
             move, _ = self._tangential_step(x, state, real(1))
             step = -residual / lengths.safe_norm(state.gradient)
             first_step = dr.select(k == 0, dr.abs(step), first_step)
@@ -204,6 +205,7 @@ class ClosestPointDescent:
         sample = self.field.evaluate(y)
         residual, state = self._state_at(y, sample)
         rows = self.field.hessian(y) if self.has_hessian else None
+        # The step along the surface is not made here, so its largest fraction (1) does not matter.
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
         step = -residual / gradient_norm
@@ -344,8 +346,8 @@ class ClosestPointDescent:
 
         sample: the sample of f at y.
 
-        f counts as smooth on the largest ball about y on which the sample's promises (proved bounds
-        of f near y) imply that; everywhere if none of them implies it.
+        f counts as smooth on the largest ball of finite radius about y on which one of the sample's
+        promises (proved bounds of f near y) implies that; everywhere if there is no such ball.
         """
         real = self.backend.Float
         scale = lengths.max_norm(y)
@@ -358,12 +360,12 @@ class ClosestPointDescent:
         for promise in sample.all_promises:
             if not promise.implies_smooth:
                 continue
-            # A radius that is not finite sets no limit to steps.
+            # A radius that is not finite is left out.
             promised_radius = real(promise.radius)
             smooth_radius = fmax(
                 smooth_radius, dr.select(dr.isfinite(promised_radius), promised_radius, 0)
             )
-        # No promise of smoothness: steps have no limit.
+        # No such ball: steps have no limit.
         smooth_radius = dr.select(smooth_radius > 0, smooth_radius, dr.inf)
         residual = real(-self.levels.offset_to_nearest(sample.value))
         return residual, _DescentState(
@@ -542,6 +544,8 @@ class ClosestPointDescent:
             along_u, along_v: the derivatives of the gradient along u and v; in them the terms of
                 the nodes before k are summed.
             """
+            # Nodes 0 and 1 are along u, 2 and 3 along v; odd nodes have the step -h, so that their
+            # terms are subtracted.
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
             gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
             term = gradient * (0.5 / step)

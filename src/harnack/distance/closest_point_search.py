@@ -303,6 +303,7 @@ def _closest_on_mesh(
     x, closest, distance, residual = in_batches(backend, compute, points)
     slack = _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + mesh.size)
     lower = np.maximum(distance - slack, 0)
+    # No promise is used here, so none is violated.
     return ClosestPoints(x, closest, distance, residual, lower, np.zeros(len(x), np.bool_))
 
 
@@ -425,6 +426,7 @@ class _QueryEvaluator:
         # 1e-12 allows for rounding; `not <=` is True for NaN.
         searched_rows = np.flatnonzero(~(distance <= self.distance_to_jumps(points) * (1 + 1e-12)))
         # First the nearest triangle alone; where that is not on the surface, all facets in turn.
+        # (NaN stands for no point, also in place of the guess.)
         guess[searched_rows] = self._nearest_face_points(points[searched_rows])
         searched_rows = searched_rows[np.isnan(guess[searched_rows, 0])]
         if len(searched_rows):
@@ -438,21 +440,21 @@ class _QueryEvaluator:
 
         points: (n, 3) the queries.
         """
-        jumps, surface = self._tracer.field.jumps, self._tracer
+        jumps, tracer = self._tracer.field.jumps, self._tracer
         mesh = jumps.mesh()
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
             return closest
-        real, index = surface.backend.Float, surface.backend.UInt32
+        real, index = tracer.backend.Float, tracer.backend.UInt32
 
         def nearest(p: Vec3) -> tuple[Vec3, Any, Vec3]:
             """Return the point of a facet that is nearest to p, the index of the facet, and the
             facet's normal at the point."""
-            no_key, always = (real(-1), index(NO_FACET)), surface.backend.Bool(True)
+            no_key, always = (real(-1), index(NO_FACET)), tracer.backend.Bool(True)
             facet = jumps.nearest_facet(p, no_key, real(dr.inf), always)
             return p + facet.offset, facet.facet, facet.normal
 
-        y, facet_id, normal = in_batches(surface.backend, nearest, points)
+        y, facet_id, normal = in_batches(tracer.backend, nearest, points)
         # `mesh` holds the vertices and the faces.
         corners = mesh[0][mesh[1][facet_id.astype(np.int64)]]
         y_within = y + _WITHIN_FACE * (corners.mean(axis=1) - y)
@@ -491,6 +493,7 @@ class _QueryEvaluator:
 
         def compute(p: Vec3, guess_point: Vec3) -> tuple[Vec3]:
             distance = safe_norm(guess_point - p)
+            # The first result is the point; a missing guess sets no limit.
             return (search.closest(p, dr.select(dr.isnan(distance), dr.inf, distance))[0],)
 
         (closest,) = in_batches(self._tracer.backend, compute, points, guess)
@@ -559,6 +562,7 @@ class _QueryEvaluator:
         if clip is not None and len(ids):
 
             def to_clip_curve(p: Vec3, y: Vec3) -> tuple[Vec3]:
+                # Without the curvature of the curve, the second result.
                 return (clip.closest(p, y)[0],)
 
             (clipped,) = in_batches(self.backend, to_clip_curve, points[ids], start[ids])
@@ -581,10 +585,11 @@ class _QueryEvaluator:
         them that hold no point of the surface nearer to the query.
         """
 
-        def arc_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
-            """Return the first-order signed distance (level - f)/|grad f| of the level from the
-            point that lies at the distance lengths.x from b in the direction of p, as a tuple of
-            one."""
+        def distance_to_level(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Real]:
+            """Return the first-order signed distance (level - f)/|grad f| of the level from a
+            point, as a tuple of one. The point lies at the distance lengths.x from the point b of
+            the boundary curve, in the direction of the query p. (A length comes as a vector of
+            three equal components, since `in_batches` takes vectors only.)"""
             to_query = p - b
             sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
@@ -592,11 +597,12 @@ class _QueryEvaluator:
             )
 
         def near_edge(p: Vec3, b: Vec3, lengths: Vec3) -> tuple[Vec3]:
-            """Run Newton's method to the surface, from the point at the distance lengths.x from b
-            in the direction of p. Returns the surface point, as a tuple of one; NaN if it is on the
-            side of b away from p."""
+            """Run Newton's method to the surface, from the point at the distance lengths.x from the
+            point b of the boundary curve, in the direction of the query p. Returns the surface
+            point, as a tuple of one; NaN if it is on the side of b away from p."""
             to_query = p - b
             y = self._descent.newton_to_level(b + lengths.x / safe_norm(to_query) * to_query)
+            # A little beyond a right angle still counts.
             is_on_query_side = dr.dot(to_query, y - b) > -_MAX_OPPOSING_COSINE * safe_norm(
                 to_query
             ) * safe_norm(y - b)
@@ -608,7 +614,7 @@ class _QueryEvaluator:
             return closest, free
         # Beside an edge of the surface f is the angle about the edge: so the first-order distance
         # of the level is the length of an arc around the edge.
-        (arc_length,) = in_batches(self.backend, arc_to_level, points, boundary, offsets)
+        (arc_length,) = in_batches(self.backend, distance_to_level, points, boundary, offsets)
         rows = np.flatnonzero(~(np.abs(arc_length) > _MAX_ARC_RADII * aside))
         start = points[rows]
         if len(rows):

@@ -270,6 +270,7 @@ def _surface(
             f"{type(field).__name__} has jumps but does not say how far they are: define the "
             f"method distance(p) of its {type(field.jumps).__name__}"
         )
+    # (An over-relaxation of 1: rays take proved steps only.)
     closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
     return TracedSurface.of(target, closely).with_call_cache(), choose_backend(
         choices.precision or "double"

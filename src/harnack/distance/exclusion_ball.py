@@ -64,6 +64,7 @@ def exclusion_radius(sample: Sample, rows: Rows | None, x: Vec3, y: Vec3) -> Rea
         # By the bounds of first and of second order: |x - y - w|^2 is at least d^2 + margin |w|^2.
         margin = 1 - 2 * d * first_order / gradient_norm
         if hessian is not None:
+            # (2: the degree of the Taylor polynomial.)
             second_order = taylor_remainder(sample, r, 2) / (r * r)
             # c r of the proof, a bound of |n . w|/|w|.
             max_slope = fmin(first_order, hessian.half_norm + second_order) * r / gradient_norm
@@ -106,6 +107,7 @@ class _HessianBounds:
         smallest = dr.select(dr.dot(to_query, plane.n) > 0, eigen.smallest, -eigen.largest)
         h_times_n = matvec(rows, plane.n)
         # The Frobenius norm is at least the spectral norm.
+        # (Below, the cross product with n has the length of the part of Hn at right angles to n.)
         squares = dr.squared_norm(rows[0]) + dr.squared_norm(rows[1]) + dr.squared_norm(rows[2])
         return cls(
             fmin(smallest, 0), safe_norm(dr.cross(h_times_n, plane.n)),

@@ -106,7 +106,9 @@ class JumpSurfaceSearch:
 
         def body(*state: Any) -> tuple[Any, ...]:
             """Trace one probe, a short ray through the nearest point of a facet, and choose the
-            next probe or facet. Returns the new state.
+            next probe or facet. Returns the new state. `next_facet` finds the facets in order,
+            `length` is half the length of the ray along the normal, and `max_count` the largest
+            number of facets.
 
             state: the attributes of the facet; the index of the probe (0 for the ray along the
                 normal, 1 to 6 for the edges of the tetrahedron); the surface point found; the
@@ -233,6 +235,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
         o = dr.fma(vector(radius), start, y)
         edge_norm = dr.norm(end - start)
         direction, edge_length = (end - start) / edge_norm, radius * edge_norm
+        # The place from which facets are looked for: no facet, no jump, no normal.
         start_crossing = JumpCrossing(real(0), index(NO_FACET), real(0), zero)
         # Up to the first facet on the edge; the two values are taken on the same side of it.
         t = real(jumps.next_crossing(o, direction, start_crossing, edge_length, active).t)
@@ -310,7 +313,7 @@ def _nearest_jump_by_differences(backend: Backend, jumps: Jumps, x: Vec3) -> Nea
     descent = vector(*differences)
     gradient_norm = dr.norm(descent)
     # The differences have the length 2 h if one facet is nearest. At a point with several nearest
-    # facets they may cancel: then x itself counts as the nearest point.
+    # facets they may cancel: then x itself counts as the nearest point, with any normal.
     has_direction = (gradient_norm > 0.2 * h) & (d > 64 * backend.machine_epsilon * size)
     direction = dr.select(has_direction, descent / gradient_norm, vector(1 / math.sqrt(3)))
     offset = dr.select(has_direction, d * direction, 0)
@@ -497,7 +500,8 @@ def compass_search(surface: SurfaceTracer, x: Vec3, foot: Vec3) -> Vec3:
         values: the planes of hits, `_HitPlanes.parts`.
         """
         hit_planes, is_global = _HitPlanes.of(values), ray < _SPHERE_RAYS
-        # The first rays of a round go to intersections of planes, the others are tilted.
+        # The first rays of a round, with `failed` from 0 to 3, go to the intersections of planes
+        # with these numbers; the others are tilted.
         to_planes = ~is_global & (failed < _PLANE_RAYS)
         direction = dr.select(
             to_planes,

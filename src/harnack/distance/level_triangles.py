@@ -72,6 +72,7 @@ class LevelTriangles:
             if surface.field.domain is not None or any(surface.level_values):
                 return None
             solid = surface.field.surface
+            # True: the surface consists of these triangles only.
             return cls(solid.corners, solid.center, solid.size, True)
         jumps = surface.field.jumps
         mesh = None if jumps is None else jumps.mesh()
@@ -93,6 +94,7 @@ class LevelTriangles:
         if is_jumps_only:
             return cls(scaled[faces], center, size, True)
         tree = _tree(choose_backend("double"), scaled, faces)
+        # The second result, the face of which each triangle is a piece, is not needed.
         pieces, _ = split_intersecting_faces(tree, scaled, faces)
         # Off the faces of such a mesh f is an integer, so that the triangles are the whole level
         # set.
@@ -108,6 +110,7 @@ class LevelTriangles:
         vector, real = backend.Array3f, backend.Float
         if not len(self.corners):
             return lambda p: vector(dr.nan) + 0 * p
+        # Each triangle has three vertices of its own.
         corners = self.corners
         faces = np.arange(3 * len(corners)).reshape(-1, 3)
         tree = _tree(backend, corners.reshape(-1, 3), faces, slabs=True)
@@ -118,6 +121,7 @@ class LevelTriangles:
             """Return the vector from p to the nearest point of a triangle."""
             x: Any = (vector(p) - center) / size
             limit = initial_squared_distance(tree, x)
+            # The place before all triangles: the squared distance -1 is below all others.
             start = real(-1), backend.UInt32(NO_TRIANGLE)
             return next_closest_triangle(tree, x, start, limit, backend.Bool(True)).offset * size
 

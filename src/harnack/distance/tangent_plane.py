@@ -76,6 +76,7 @@ class SymmetricEigen2:
     @classmethod
     def of(cls, uu: Real, vv: Real, uv: Real) -> SymmetricEigen2:
         """Return the eigenvalues and eigenvectors of the matrix ((uu, uv), (uv, vv))."""
+        # The eigenvectors are turned against the axes by half the polar angle of (half, uv).
         middle, half = 0.5 * (uu + vv), 0.5 * (uu - vv)
         spread = dr.sqrt(dr.fma(half, half, uv * uv))
         s, c = dr.sincos(0.5 * dr.atan2(uv, half))

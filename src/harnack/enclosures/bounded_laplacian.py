@@ -243,14 +243,17 @@ class _GreenCondition:
         return self.gap + 0.5 * first, second
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q) = g + 1 + (sqrt(S) - 1)/q, in a form that does not cancel near q = 0. S is
-        (1-q)^2 times (1 + the left side of the condition). In the code c is (S - 1)/q + 2, and root
-        is sqrt(S)."""
+        """Return k(q) = g + 1 + (sqrt(S) - 1)/q, in a form that does not cancel near q = 0. The
+        condition holds at the fraction q of the radius if q k(q) <= g, where g = sqrt(1 + d) - 1
+        for the gap d. S is (1-q)^2 times (1 + the left side of the condition). In the code c is (S
+        - 1)/q + 2, and root is sqrt(S)."""
         s, r, p = q * q, 1 / (1 + q), 1 - q
         log = 2 - dr.log(fmax(q, 1e-30))
+        # The first three terms of the left side are q inner/(1-q^2)^2.
         inner = q * dr.fma(self.weight, 5 - s, GREEN_KERNEL_BOUND * self.spread * log)
         inner = dr.fma(self.slope, 3 + s, inner)
         c = dr.fma(inner, r * r, q * dr.fma(self.mean * (1 / 6) * p, p, 1))  # (S-1)/q + 2
         root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
         inverse = 1 / (root + 1)
+        # By root - 1 = q (c - 2)/(root + 1); g is `gap`.
         return self.gap + inverse * (c + q * (c - 2) * inverse)

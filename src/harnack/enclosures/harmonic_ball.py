@@ -159,6 +159,7 @@ def _fraction_4d_down(u: Real, v: Real, gap: Real) -> Real:
     for _ in range(4):
         h = gap - q * (u + v * (3 + 3 * q + q * q))
         q = q + fmin(h, 0) / (u + 3 * v * (1 + q) * (1 + q))
+    # h at the end of the iteration, and the zero of the chord.
     h = fmin(gap - q * (u + v * (3 + 3 * q + q * q)), 0)
     return q * gap / (gap - h)
 
@@ -263,7 +264,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             mean_upper = dr.select(u > 0, slopes.upper * scale, 0)
             mean_lower = dr.select(u > 0, slopes.lower * scale, 0)
             slack = condition_rounding(type(gaps.above))
-            # NaN for a slope counts as the worst one, on both sides.
+            # NaN for a slope counts as the worst one, on both sides. (Below, a gap toward 0 counts
+            # as at most u, since u stays positive.)
             m_max, m_min = fmax(fmin(mean_upper + slack, 1), -1), clamp(mean_lower - slack, -1, 1)
             conditions_away.append(
                 _ChordCondition.of(fmin(gap_away * inv_u, _UNREACHABLE_GAP), m_max, self.dimension)
@@ -317,10 +319,10 @@ class _ChordCondition:
         return self.gap + n * self.mean / k, second
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q) = g + 1 + (B^(1/K) - 1)/q, in a form that does not cancel near q = 0. B is
-        the chord of Poisson's kernel, at the mean m, times (1-q)^K; K is n - 1. In the code
-        (B - 1)/q is c - K, and root is B^(1/K); so (root - 1)/q follows from c without a difference
-        of large numbers."""
+        """Return k(q) = g + 1 + (B^(1/K) - 1)/q, in a form that does not cancel near q = 0. The
+        condition is q k(q) <= g, where g is `gap`. B is the chord of Poisson's kernel, at the mean
+        m, times (1-q)^K; K is n - 1. In the code (B - 1)/q is c - K, and root is B^(1/K); so (root
+        - 1)/q follows from c without a difference of large numbers."""
         m, r, s = self.mean, 1 / (1 + q), q * q
         if self.dimension == 2:
             return self.gap + 2 * (q + m) * r
@@ -328,11 +330,13 @@ class _ChordCondition:
             c = dr.fma(q * (5 - s) + m * (3 + s), r * r, q)  # (B - 1)/q + 2
             root = dr.sqrt(fmax(dr.fma(q, c - 2, 1), 0))
             inverse = 1 / (root + 1)
+            # By root - 1 = q (c - 2)/(root + 1).
             return self.gap + inverse * (c + q * (c - 2) * inverse)
         a = q * (9 + s * (s - 2)) + 4 * m * (1 + s)
         c = dr.fma(a, r * r * r, q * (3 - q))  # (B - 1)/q + 3
         root = dr.cbrt(fmax(dr.fma(q, c - 3, 1), 0))
         inverse = 1 / dr.fma(root, root + 1, 1)
+        # By root - 1 = q (c - 3)/(root^2 + root + 1).
         return self.gap + inverse * (c + q * (c - 3) * inverse * (root + 2))
 
 
@@ -363,10 +367,11 @@ class _JensenCondition:
 
     def __call__(self, q: Real) -> Real:
         """Return k(q) = (1-g) (D^(n/2) - 1 + q^2)/q + g q with D = 1 + q^2 - 2 q m, in a form that
-        does not cancel near q = 0. In the code d is D, e is (D - 1)/q, x is the root of D, and
-        `rise` is (D^(n/2) - 1 + q^2)/q."""
+        does not cancel near q = 0. The condition is q k(q) <= g, where g is `gap`. In the code d is
+        D, e is (D - 1)/q, x is the root of D, and `rise` is (D^(n/2) - 1 + q^2)/q."""
         e = q - 2 * self.mean
         d = dr.fma(q, e, 1)
+        # (D^(n/2) - 1)/q is e, e (D + x + 1)/(x + 1) and e (D + 1) for n = 2, 3 and 4.
         if self.dimension == 2:
             rise = q + e
         elif self.dimension == 4:
@@ -510,19 +515,21 @@ class _CapCondition:
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
         """Return k(0) and k'(0)."""
-        x, y, rest = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
+        x, y, weight = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
         second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
-        return 3 * rest * self.shift, dr.fma(rest, second, self.gap)
+        return 3 * weight * self.shift, dr.fma(weight, second, self.gap)
 
     def __call__(self, q: Real) -> Real:
-        """Return k(q), in a form that does not cancel near q = 0. For each of s1 and s2, s^2 = 1 +
-        q e with a number e, so s = 1 + q x with x = e/(s+1). In the code `total` is the sum of the
-        two numbers x, and `rise` is (S - 1 + q^2)/q."""
+        """Return k(q) = (1-g) (S - 1 + q^2)/q + g q, in a form that does not cancel near q = 0. The
+        condition is q k(q) <= g, where g is `gap`. For each of s1 and s2, s^2 = 1 + q e with a
+        number e, so s = 1 + q x with x = e/(s+1). In the code `total` is the sum of the two numbers
+        x, and `rise` is (S - 1 + q^2)/q."""
         e1, e2 = q - 2 * (self.rest - self.shift), q + 2 * (self.rest + self.shift)
         one_minus_q, one_plus_q = 1 - q, 1 + q
         s1 = dr.sqrt(dr.fma(one_minus_q, one_minus_q, 2 * q * (self.p + self.shift)))
         s2 = dr.sqrt(dr.fma(one_plus_q, one_plus_q, -2 * q * (self.p - self.shift)))
         inverse = 1 / ((s1 + 1) * (s2 + 1))
         total = dr.fma(e1, s2 + 1, e2 * (s1 + 1)) * inverse  # x1 + x2
+        # By S = s1 s2 (1 + q total/2) and s1 s2 = 1 + q total + q^2 x1 x2.
         rise = q * dr.fma(e1 * e2, inverse, 1) + total * dr.fma(0.5 * s1, s2, 1)
         return dr.fma(1 - self.gap, rise, self.gap * q)

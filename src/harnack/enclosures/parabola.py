@@ -161,6 +161,7 @@ def first_reach(gap: Real, slope: Real, curvature: Real) -> Real:
     slope_size, turn_slope = dr.abs(slope), _max_turning_slope(gap, curvature)
     larger, smaller = fmax(slope_size, turn_slope), fmin(slope_size, turn_slope)
     ratio = dr.select(larger > 0, smaller / larger, 0)
+    # r; NaN where it is not real, where the result is infinite.
     root = larger * dr.sqrt(dr.fma(dr.select(turns_away, -ratio, ratio), ratio, 1))
     # Without an upward curvature and with slope <= 0 the gap is never reached; at a gap of 0 it is
     # at once.

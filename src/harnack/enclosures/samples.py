@@ -98,7 +98,7 @@ class Sample:
     def select(self, mask: Mask, other: Sample) -> Sample:
         """The sample `other` on the lanes on which the mask is true, and this sample on all other
         lanes. Both samples must have promises of the same kinds in the same order. The result has
-        no shading normal."""
+        no shading normal, and the mask `branch_unknown` of this sample."""
         names = "value", "gradient", "value_error", "gradient_error", "truncation_error"
         numbers = {k: dr.select(mask, getattr(other, k), getattr(self, k)) for k in names}
         groups: dict[str, Any] = {}
@@ -200,10 +200,9 @@ def value_error_bound(sample: Sample, gradient_norm: Real, size: Real) -> Real:
     """
     kind = cast("Any", type(sample.value))
     epsilon = 2 * float(dr.epsilon(kind))
-    # The rounding of eight units in the last place, which `Sample.value_error` leaves out. Numbers
-    # below the smallest normal one may underflow to 0.
-    # The machine epsilon is twice Dr.Jit's epsilon; eight units in the last place are at most 8 of
-    # it.
+    # The rounding of eight units in the last place, which `Sample.value_error` leaves out: at most
+    # 8 machine epsilons (each is twice Dr.Jit's epsilon) of the value. Numbers below the smallest
+    # normal one may underflow to 0.
     smallest = kind(float(dr.smallest(kind)))
     value = 8 * fmax(epsilon * dr.abs(sample.value), smallest)
     # The rounding of p moves it by at most 4 epsilon times size.

@@ -153,17 +153,17 @@ class AffineForm(FormulaNumber):
             value.radius + _rounding_bound(dr.abs(value.midpoint)),
         )
         best = _smaller_error(_smaller_error(chord, mean_slope_line), constant_line)
-        center, best_slope, error = best
+        best_center, best_slope, best_error = best
         # The line as a function of e, by f = self.center + self.slope e + r.
         shift = best_slope * (self.center - middle)
         rounding = _rounding_bound(
-            dr.abs(center)
+            dr.abs(best_center)
             + dr.abs(best_slope) * (dr.abs(self.center) + dr.abs(self.slope) + self.error)
         )
         return AffineForm(
-            center + shift,
+            best_center + shift,
             best_slope * self.slope,
-            error + dr.abs(best_slope) * self.error + rounding,
+            best_error + dr.abs(best_slope) * self.error + rounding,
         )
 
     def pointwise_maximum(self, other: Any) -> AffineForm:
@@ -175,6 +175,7 @@ class AffineForm(FormulaNumber):
         # max(t, 0) on [x, y], x < 0 < y: its chord has slope y/(y - x) and lies above by at most
         # -x y/(y - x), at 0.
         chord_slope = difference_range.upper / (difference_range.upper - difference_range.lower)
+        # The line lies in the middle between the chord and the chord lowered by `excess`.
         excess = -difference_range.lower * chord_slope
         center = chord_slope * (difference.center - difference_range.lower) - 0.5 * excess
         size = dr.abs(chord_slope) * (
@@ -202,6 +203,8 @@ class AffineForm(FormulaNumber):
         of a direction c near the middle of z's range, plus the angle of z relative to c
         (`relative_angle`). Where that is not proved, only [-pi, pi] is known.
         """
+        # c = (a, b). The range of its angle is as narrow as rounding: its middle belongs to the
+        # center, its radius to the error.
         relative, is_valid, a, b = relative_angle(self, x, self.center, x.center)
         c_angle, _ = angle_range(Interval.point(b), Interval.point(a))
         center = relative.center + c_angle.midpoint
@@ -211,7 +214,7 @@ class AffineForm(FormulaNumber):
             + _rounding_bound(dr.abs(center) + dr.abs(c_angle.midpoint))
         )
         is_valid &= dr.isfinite(center) & dr.isfinite(relative.slope) & dr.isfinite(error)
-        half_turn = math.pi * (1 + 1e-6)
+        half_turn = math.pi * (1 + 1e-6)  # above pi in every precision
         return AffineForm(
             dr.select(is_valid, center, 0),
             dr.select(is_valid, relative.slope, 0),

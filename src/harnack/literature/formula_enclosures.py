@@ -158,9 +158,9 @@ class BandEnclosure(Enclosure):
         proved."""
         no_level = gap == dr.inf
         remaining = gap - offset
-        reach = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
+        length = dr.select(slope > 0, remaining / slope * STEP_SAFETY, self.reach)
         is_valid = (remaining > 0) & dr.isfinite(slope)  # and not NaN
-        return dr.select(no_level, self.reach, dr.select(is_valid, fmin(reach, self.reach), 0))
+        return dr.select(no_level, self.reach, dr.select(is_valid, fmin(length, self.reach), 0))
 
 
 class AffineEnclosure(BandEnclosure):

@@ -237,8 +237,10 @@ class ParabolaBounds(FormulaNumber):
         highs: list[Real] = []
         for a, _ in self.bounds:
             for c, _ in other.bounds:
+                # The factor of s is `linear` at s = 0 and `linear` + `quadratic` at s = h.
                 linear, quadratic = v * c + w * a, a * c * h
                 rounding = _rounding_bound(dr.abs(v * c) + dr.abs(w * a) + dr.abs(quadratic))
+                # v and w may be off by their radii.
                 rounding += rv * dr.abs(c) + rw * dr.abs(a)
                 lows += [linear - rounding, linear + quadratic - rounding]
                 highs += [linear + rounding, linear + quadratic + rounding]
@@ -611,6 +613,7 @@ class ParabolaBounds(FormulaNumber):
         slope -value/length is enough for all s >= end. Likewise slope -value/end is small enough to
         be below -value for all s >= end.
         """
+        # (Factors a little above 1 allow for rounding.)
         (low_slope, _), (high_slope, _) = self.bounds
         length_fraction = (end - start) / end * (1 + 8 * machine_epsilon(length))
         slope_behind = -(value.lower / length)
@@ -648,6 +651,7 @@ def _lines_bounding_cubic(c0: Real, c1: Real, c2: Real, c3: Real) -> tuple[Real,
     both. If rounding mistakes the sign of a second derivative, that derivative is as small as its
     rounding error.
     """
+    # (NaN or infinite for c3 = 0: then it is outside.)
     t = -c2 / (3 * c3)
     is_divided = (t > 0) & (t < 1)
     t = dr.select(is_divided, t, 1)
@@ -765,6 +769,8 @@ def _maximum_on_piece(q: Quadratic, length: Real) -> Real:
     a, b = q
     if _is_zero(a) and _is_zero(b):
         return 0 * length
+    # The largest value is at 0, at the end, or at the vertex if the parabola rises to it and then
+    # falls on the way: there it is -a^2/(4b).
     end_value = length * (a + b * length)
     end_value = end_value + _rounding_bound(length * (dr.abs(a) + dr.abs(b) * length))
     has_vertex = (b < 0) & (a > 0) & (a + 2 * b * length < 0)
@@ -782,6 +788,7 @@ def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
         number 0."""
         if _is_zero(y):
             return x
+        # (0.0: no size besides that of the sum. The rounding of x and y is in them already.)
         return y if _is_zero(x) else _shift_by_rounding(x + y, sign, 0.0)
 
     return plus(first[0], second[0]), plus(first[1], second[1])

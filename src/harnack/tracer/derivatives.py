@@ -57,6 +57,8 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
             would be wrong.
     """
     field = prepared.field
+    # Plain data has no derivatives; other attributes may hide some, which raises an error. (None:
+    # the memory has a single entry for each field.)
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         field.refuse_hidden_parameters()
     parameters = prepared.field.differentiable_parameters()

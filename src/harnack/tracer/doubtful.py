@@ -141,6 +141,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
         offset, error, is_sure = offset_of(sample)
         above, below = now.above | (is_sure & (offset > 0)), now.below | (is_sure & (offset < 0))
+        # With the sign `side`, slopes < 0 lead towards the level.
         slope = side * dr.dot(sample.gradient, direction)
         first_slope = side * dr.dot(at_hit.gradient, direction)
         is_seen = (above & below) | (now.searches & (dr.abs(offset) <= error))
@@ -152,6 +153,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         is_high = is_turning | (now.searches & ~is_low)
         low = dr.select(is_turning, 0, dr.select(is_low, length, now.low))
         high = dr.select(is_high, length, now.high)
+        # Down to an interval as short as rounding (`smallest`).
         goes_on = is_turning | (now.searches & (high - low > smallest))
         keeps_way = goes_on & ~is_seen
         # Next direction; after the last one, the distance grows.
@@ -175,7 +177,9 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
             active=now.active & ~is_seen & (distance <= farthest),
         )
 
-    # The sample at the hit may show a side of the level. No interval is known yet (zeros).
+    # The sample at the hit may show a side of the level. No interval is known yet (zeros). In the
+    # order: distance, way, above, below, low, high, their slopes, searches, may_turn, sample_count,
+    # is_found, active.
     zero, yes, no = backend.Float(0), backend.Bool(True), backend.Bool(False)
     begin = _SearchState(
         hits.distance, backend.UInt32(0), is_sure & (offset > 0), is_sure & (offset < 0),

@@ -238,7 +238,8 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     count = dr.width(o, d)
     if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
-    # Compare about 4096 rays with their successors.
+    # Compare about 4096 rays with their successors. (An opaque step compiles no new kernel if it
+    # changes.)
     step = (count - 1) // min(count - 1, _SAMPLED_RAYS)
     indices = dr.arange(backend.UInt32, (count - 1) // step) * dr.opaque(backend.UInt32, step)
 
@@ -276,6 +277,7 @@ def _first_hits(
     is_hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
     normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
+    # The index of the facet or patch; -1 for none.
     index = dr.full(backend.Int32, -1, dr.width(end.status))
     if prepared.field.jumps is not None:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1

@@ -150,10 +150,10 @@ class JumpTracer:
         before = real(self.start * (1 - self.backend.machine_epsilon) - 1e-30)
         offset = real(self.jumps.initial_offset(o, d, before, state.active))
         # The place from which facets are looked for: no facet, no jump, no normal.
-        start = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
+        no_crossing = JumpCrossing(before, count(NO_FACET), real(0), vector(0))
         # Only rays that look for crossings of the level have a contact.
         reported = None if state.contact is None else count(NO_FACET)
-        return JumpTraceState(offset, start, state, reported)
+        return JumpTraceState(offset, no_crossing, state, reported)
 
     def finish(self, outer: JumpTraceState) -> tuple[MarchState, Any]:
         """Return the end state of rays as a `MarchState`, and the index of the facet that each ray
@@ -232,22 +232,23 @@ class JumpTracer:
         passed: Mask,
         stopped: Mask,
     ) -> JumpTraceState:
-        """Return the state after an interval for rays that look for crossings of the level. A ray
-        that has crossed the level at a facet has passed this facet, and the caller may make it
-        active again.
+        """Return the state after an interval for rays that look for crossings of the level. Where a
+        ray has crossed the level at a facet, the returned state is behind this facet, but not
+        active; the caller may make it active again, to look for the next crossing.
 
         previous: the state before the interval.
         now: the march at the end of the interval.
-        ahead, last: facets that the ray crosses at the same point are merged into one crossing,
-            `ahead`, at the end of the interval; `last` is the last of them, from which the ray goes
-            on.
-        passed: mask of rays that have passed the facet without crossing the level.
+        ahead: the crossing of a facet at the end of the interval. It may stand for several facets
+            that the ray crosses at the same point, with the sum of their jumps.
+        last: the last of these facets, from which the ray goes on.
+        passed: mask of rays that go on behind the facet, as they did not cross the level there.
         stopped: mask of rays whose interval ends at a facet.
         """
         used_all_steps = passed & (now.evaluations >= self.march.max_steps)
         status = dr.select(
             used_all_steps, self.backend.UInt32(int(RayStatus.OUT_OF_STEPS)), now.status
         )
+        # Rays that crossed the level at the facet are behind it, too.
         is_past = passed | (stopped & (now.status == HIT_AT_JUMP))
         # Rays that are past the facet go on from the last merged crossing.
         behind = JumpCrossing(
@@ -295,8 +296,9 @@ class JumpTracer:
         limit = fmax(fmin(first.t + tolerance / sine, self.end), first.t)
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
-            """Add the next crossing of a facet to the sums, if it is at the same point, and return
-            the new sums."""
+            """Add the next crossing of a facet to the sums, if it is at the same point as the
+            crossing `first` up to rounding, that is, not beyond the parameter `limit`. Returns the
+            new sums."""
             # The field looks for the next crossing after the place (t, facet) of the last one. The
             # jump and the normal of that one are not used.
             crossing = self._next(
@@ -324,7 +326,7 @@ class JumpTracer:
             )
 
         no_facet = count(NO_FACET)
-        start = _CoincidentJumps(
+        initial = _CoincidentJumps(
             jump=first.jump,
             t=first.t,
             last=first.facet,
@@ -335,7 +337,7 @@ class JumpTracer:
             folded=self.backend.Bool(False),
             active=self.backend.Bool(active) & (first.facet != NO_FACET),
         )
-        total = loop_while_active(start, add_next, "together")
+        total = loop_while_active(initial, add_next, "together")
         # The first facet whose jump has the sign of the sum gives index and normal.
         rises, falls = total.jump > 0, total.jump < 0
         facet = dr.select(rises, total.up, dr.select(falls, total.down, first.facet))
@@ -357,6 +359,7 @@ class JumpTracer:
         """
         real, vector, count = self.backend.Float, self.backend.Array3f, self.backend.UInt32
         ahead = self.jumps.next_crossing(self.path.origin, self.path.direction, behind, end, active)
+        # The field may return other arrays or Python numbers; all become arrays of this backend.
         is_valid = real(ahead.t) <= end
         is_valid &= count(ahead.facet) != NO_FACET
         return JumpCrossing(

@@ -444,7 +444,8 @@ class Hysteresis:
         point that is near enough for a hit, and ends where f is farther from the level than the
         band. Inactive rays keep their contact.
         """
-        # f minus the nearest level: positive on the side of larger values.
+        # f minus the nearest level: positive on the side of larger values. `side` is the side from
+        # which the ray came: 1 for larger values, -1 for smaller ones, 0 if not known.
         offset = -self.levels.offset_to_nearest(accepted.value)
         was_touching = now.is_touching
         side = dr.select(was_touching, now.side, self._side(now, accepted, offset))
@@ -453,6 +454,7 @@ class Hysteresis:
         t, value, slope, gradient = accepted.before
         offset_before = -self.levels.offset_to_nearest(value)
         changes_side = active & was_touching & (side * offset_before > 0) & (side * offset <= 0)
+        # The part of the way between the two points; slopes are those by this part.
         fraction = cubic_root(
             offset_before, offset, (accepted.t - t) * slope, (accepted.t - t) * accepted.slope
         )
@@ -479,6 +481,7 @@ class Hysteresis:
         settles = active & is_off & (side == 0)
         side = dr.select(settles | crosses, dr.select(offset > 0, type(offset)(1), -1), side)
         is_touching = dr.select(was_touching, dr.abs(offset) <= accepted.band, accepted.is_near)
+        # In the order: side, is_touching, root, gradient, tolerance_excess, before, after, band.
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, is_touching, was_touching),
@@ -504,7 +507,8 @@ class Hysteresis:
         A function with jumps has a single level where crossings are counted. A ray that starts on a
         facet, up to rounding, is on neither side of the level.
         """
-        # f minus the level, before the facet and behind it.
+        # f minus the level, before the facet and (below) behind it. `side` is the side from which
+        # the ray came: 1 for larger f, -1 for smaller f, 0 if not known.
         offset = -self.levels.offset_to_nearest(accepted.value)
         one = type(offset)(1)
         side = dr.select(now.is_touching, now.side, dr.select(offset > 0, one, -1))
@@ -523,6 +527,9 @@ class Hysteresis:
         crosses = active & is_off & (side * offset_behind < 0)
         side = dr.select(is_off, dr.select(offset_behind > 0, one, -1), side)
         at_facet = changes_side | begins
+        # In the order: side, is_touching, root, gradient, tolerance_excess, before, after, band.
+        # At a facet the root is exact, so there is no excess, and the facet's normal stands for the
+        # gradient.
         return Contact(
             dr.select(active, side, now.side),
             dr.select(active, dr.abs(offset_behind) <= accepted.band, now.is_touching),
@@ -609,10 +616,12 @@ def refine_crossing(
         is_near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)
         )
-        # The half in which f changes sides.
+        # The half in which f changes sides. (`side` is 1 if f is larger before the crossing, else
+        # -1.)
         is_before = side * offset > 0
         before = dr.select(is_before, now.t, now.before)
         behind = dr.select(is_before, now.behind, now.t)
+        # The interval may become as short as rounding.
         goes_on = ~is_near & (behind - before > smallest * size)
         # If the cubic's root is good, its gradient stays.
         is_good_root = is_near & (now.sample_count == 0)

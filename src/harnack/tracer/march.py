@@ -137,7 +137,8 @@ class MarchState:
         has_detail: whether the accuracy of samples can be chosen; then the state has an
             `accuracy_scale`.
         crosses: whether rays end only where f has passed to the other side of a level, and not
-            where they reach the level.
+            where they reach the level; then the state has a `contact`, the level that the ray
+            reached last, which is none at first.
         """
         real, vector, count = backend.Float, backend.Array3f, backend.UInt32
         return cls(
@@ -150,6 +151,7 @@ class MarchState:
             tolerance_excess=real(0),
             evaluations=count(0),
             accuracy_scale=real(0) if has_detail else None,
+            # A miss, as long as no hit is found.
             status=count(int(RayStatus.MISS)),
             active=backend.Bool(active) & (start < end),
             contact=Contact.none(backend) if crosses else None,
@@ -427,8 +429,10 @@ class March:
         """
         if self.hysteresis is None or now.contact is None:
             return accepted, now.proved_step
-        tolerance = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
-        band_reaches = self.hysteresis.may_reach(now.contact, trial.band, now.trial_step, tolerance)
+        tolerance_length = dr.fma(trial.t, self.tolerance.per_length, self.tolerance.distance)
+        band_reaches = self.hysteresis.may_reach(
+            now.contact, trial.band, now.trial_step, tolerance_length
+        )
         band_reaches &= ~now.contact.is_touching | dr.isfinite(trial.total_error)
         shorter = fmin(now.proved_step, _RETRY_FRACTION * now.trial_step)
         fallback = dr.select(band_reaches | too_coarse, now.proved_step, shorter)
@@ -491,6 +495,7 @@ class March:
             scale = self.rule.accuracy_of(field.variable_accuracy, now.accuracy_scale)
             scaled = field.variable_accuracy.at(scale)
         unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
+        # Enclosures are wanted ahead of the point, and back to where the ray is proved already.
         ray_sample = scaled.sample_ray(
             path, t, fmin(now.enclosure_reach, end - t), fmax(unproved, real(0))
         )
@@ -516,6 +521,7 @@ class March:
         )
         evaluations: Any = 0
         if steep is not None:
+            # Points at which f may equal a level up to rounding are tested as well.
             touches = steep.is_level
             is_near = (is_near | touches) & now.active & dr.isfinite(total_error)
             is_near, evaluations = self._confirms_level(
@@ -533,6 +539,7 @@ class March:
             value_tolerance=within,
             band=within,
             is_near=is_near,
+            # A ray that ends at the point need not know on which side of the level f is.
             accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
             is_smooth=ahead is None and field.variable_accuracy is None,
@@ -588,10 +595,10 @@ class March:
         `HitTolerance.value` always counts.
         """
         sample, p = ray_sample.sample, path.point(t)
-        tolerance = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
+        tolerance_length = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
         # A bound of the rounding of the point.
         slack = 8 * self.backend.machine_epsilon * size
-        reach = fmax(tolerance, 2 * slack)
+        reach = fmax(tolerance_length, 2 * slack)
         is_proved = gaps.nearest <= self.tolerance.value
         # The change of f along the ray may prove that it takes the level.
         for enclosure in ray_sample.forward:
@@ -788,6 +795,7 @@ class March:
         Returns the two steps. The proved step is inf if the ray ends before the next cell that may
         hold a level.
         """
+        # Where the point was not accepted, nothing is searched: the search begins at the end.
         free_to = dr.select(accepted, point.t + proved_step, self.ray_end)
         free_to = occupied.end_of_empty_run(path.origin, path.direction, free_to, self.ray_end)
         proved_step = fmax(
@@ -823,6 +831,7 @@ class March:
         """
         # After a step of zero, the next enclosures need reach only a third as far: bisection. On a
         # ray without an end, an infinite reach becomes one of some sizes of the coordinates.
+        # (16 is "some sizes"; 1 is for coordinates of 0.)
         candidate = fmin(now.enclosure_reach, end - trial.t)
         shorter = dr.select(dr.isfinite(candidate), candidate / 3, 1 + 16 * trial.coordinate_size)
         reach = dr.select(proved > 0, trial.on_ray.reach_growth * proved, shorter)
@@ -929,6 +938,7 @@ class March:
         slope = ray_sample.slope
         slope_size, gap = dr.abs(slope), dr.select(slope > 0, gaps.above, gaps.below)
         if is_smooth:
+            # Times the sign of the slope: positive towards the level.
             second_derivative = dr.mulsign(self._second_derivative(ray_sample, now, path), slope)
             discriminant = dr.fma(slope_size, slope_size, 2 * second_derivative * gap)
             target = _TRIAL_AIM * dr.select(

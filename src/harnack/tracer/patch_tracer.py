@@ -101,6 +101,7 @@ class PatchTracer:
         """
         real, count = self.march.backend.Float, self.march.backend.UInt32
         return PatchTraceState(
+            # Before all entries, whose parameters are at least 0.
             enter=real(-1),
             box=count(NO_PATCH),
             t=real(self.end),
@@ -120,6 +121,7 @@ class PatchTracer:
         walk: the tracer's own state when no ray is active any more.
         """
         backend = self.march.backend
+        # (Patches are sampled with a single accuracy, and need no accuracy scale.)
         before = MarchState.at(backend, self.start, self.end, walk.active, has_detail=False)
         end = dataclasses.replace(
             before,
@@ -153,6 +155,7 @@ class PatchTracer:
         # (Inactive lanes get patch 0, since NO_PATCH is no index.)
         patch = self.patches.patch(dr.select(active, entry.patch, 0))
         used_all_steps = active & (walk.evaluations >= self.march.max_steps)
+        # (Patches are sampled with a single accuracy, and need no accuracy scale.)
         now = MarchState.at(backend, start, end, active & ~used_all_steps, has_detail=False)
         now = dataclasses.replace(now, evaluations=backend.UInt32(walk.evaluations))
         now = self.march.advance(patch, path, backend.Float(end), now)

@@ -121,6 +121,7 @@ class PixelCones:
         march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
         now = march.advance(prepared.field, path, real(end), state)
+        # A hit is a point at which the ray comes to the cover.
         is_hit = now.status == int(RayStatus.HIT)
         begin = dr.select(is_hit, now.proved_to, 0)
         gap = prepared.levels.offset_to_nearest(now.value)
@@ -130,6 +131,7 @@ class PixelCones:
         def sample_at(t: Real) -> tuple[Real, Real]:
             """Return the height over the surface at parameters t, in radii of the cone, and its
             derivative along the ray."""
+            # With the accuracy at which the march has ended.
             field, accuracy = prepared.field, prepared.field.variable_accuracy
             if accuracy is not None and now.accuracy_scale is not None:
                 field = accuracy.at(now.accuracy_scale)
@@ -175,16 +177,19 @@ class PixelCones:
         offset = value - level
         if period is not None:
             offset = dr.fma(dr.round(offset / period), -period, offset)
+        # The height as a difference of f, which is divided by `radius_in_value` below.
         height = side * offset
         if self.solid is not None:
+            # Outside of the solid f is below `low` or above `high`: one of the differences is
+            # positive, and counts. `side` tells whether the height rises with f.
             low, high = self.solid
             height = fmax(low - value, value - high)
             side = dr.select(low - value > value - high, -1, type(value)(1))
         # The radius of the cone, as a difference of f.
-        radius = safe_norm(gradient) * self.radius * t
-        has_slope = radius > 0
-        slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius, 0)
-        return dr.select(has_slope, height / radius, dr.inf), slope
+        radius_in_value = safe_norm(gradient) * self.radius * t
+        has_slope = radius_in_value > 0
+        slope = dr.select(has_slope, side * dr.dot(gradient, self.direction) / radius_in_value, 0)
+        return dr.select(has_slope, height / radius_in_value, dr.inf), slope
 
     def _clip(self) -> tuple[Real, Real]:
         """Return the interval (start, end) of ray parameters on which the cones can touch the
@@ -228,12 +233,16 @@ def _next_step(height: Real, slope: Real, second_derivative: Real, longest: Real
     sqrt(slope^2 + 2 r second_derivative)). Steps lead a little beyond these points.
     """
     real = cast("Any", type(height))
+    # Where the height falls: to a radius behind the surface, and to where the slope becomes 0.
+    # (`_NEGLIGIBLE` avoids divisions by 0.)
     length_to_behind = (height + 1 + _AIM_MARGIN) / fmax(-slope, real(_NEGLIGIBLE))
     length_to_lowest = dr.select(
         second_derivative > _NEGLIGIBLE,
         (1 + _AIM_MARGIN) * -slope / fmax(second_derivative, real(_NEGLIGIBLE)),
         dr.inf,
     )
+    # Where it rises: the rest of the height, and the slope at its end. If the rise slows down, the
+    # slope counts as constant.
     rest = fmax(_END_HEIGHT + _AIM_MARGIN - height, real(0))
     end_slope = dr.sqrt(slope * slope + 2 * fmax(second_derivative, real(0)) * rest)
     length_to_outside = 2 * rest / fmax(slope + end_slope, real(_NEGLIGIBLE))

@@ -159,6 +159,7 @@ def find_crossings(
         is_crossing = is_at_crossing
         if facet is not None and jumps is not None and jumps.takes_all_levels:
             is_crossing = is_at_crossing & (facet != NO_FACET)
+        # The place of the next crossing of each ray in the arrays of results.
         slot = first_slot + now.count
         dr.scatter(t, contact.root, slot, is_crossing)
         dr.scatter(side, contact.side, slot, is_crossing)

@@ -115,6 +115,7 @@ def _check_numpy_rays(lengths: FloatArray, near: FloatArray, far: FloatArray) ->
     lengths: (n,) largest absolute coordinates of the directions.
     near, far: (n,) t_min and t_max.
     """
+    # (Conditions are negated so that NaN counts as wrong, too.)
     zero = np.flatnonzero(~(lengths >= np.finfo(lengths.dtype).smallest_normal))
     if zero.size:
         raise ValueError(

@@ -55,6 +55,7 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
         value = formula(*coordinates)
     except TypeError:  # this formula takes ranges of derivatives alone
         return None
+    # (The formula may be a plain number; it becomes a range here.)
     return coordinates[0].coerce(value).checked()
 
 
@@ -100,14 +101,16 @@ class SteepPlace:
     def at(
         cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
-        """Compute the bounds at the parameter t of rays.
+        """Compute the bounds at the parameter t of rays: of the error of f at the point, and of the
+        length beyond the point on which f takes no level.
 
         ahead: the length of the ray beyond t on which values are bounded.
         sample: the sample of f at t.
 
-        Proof of the error. The exact point differs from the rounded point by at most `slack` in
-        each coordinate. So it lies in a box around the rounded point, and f there lies in the range
-        of f on this box. If there is a single level, only the part of the error towards it counts.
+        Proof of the bound of the error. The exact point differs from the rounded point by at most
+        `slack` in each coordinate. So it lies in a box around the rounded point, and f there lies
+        in the range of f on this box. If there is a single level, only errors count by which f may
+        be nearer to this level.
 
         Proof of the free length. All points of the ray on this length lie in the box around its two
         ends, enlarged by rounding. All values of f in the box lie in its range, and the range
@@ -215,7 +218,7 @@ def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -
     if levels.period is not None:
         is_held = (low - value <= -gaps.below) & (high - value >= -gaps.below)
         return is_held | ((low - value <= gaps.above) & (high - value >= gaps.above))
-    is_held: Mask = value < value
+    is_held: Mask = value < value  # false everywhere
     for level in levels.values:
         is_held |= (low <= level) & (high >= level)
     return is_held
@@ -264,7 +267,9 @@ def beyond(
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """Evaluate f at the next point q, and return the state after it."""
+        """Evaluate f at the next point q, and return the state after it. The variables p, value,
+        gaps, ways (two directions, each with the slope of f along it), reach and searches are the
+        parameters of `beyond`; `shortest` is a length as short as rounding."""
         # Which of the points q comes next.
         is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
         is_search = now.count >= _TRIAL_COUNT
@@ -331,7 +336,8 @@ def beyond(
             active=active,
         )
 
-    # The search begins at p (`inner` = 0), in the interval from 0 to `reach`.
+    # The search begins at p (`inner` = 0), in the interval from 0 to `reach`. In the order: count,
+    # side_count, passed, active, low, high, inner, least_gap.
     begin = _SearchState(
         backend.UInt32(0), backend.UInt32(0), backend.Bool(False), backend.Bool(active),
         backend.Float(0), backend.Float(reach), backend.Float(0), backend.Float(gaps.nearest),

@@ -188,6 +188,7 @@ def _check_side(side: Any, levels: Sequence[Any]) -> Side | None:
     if side is not None and not is_one_of(side, SIDES):
         names = ", ".join(f'"{name}"' for name in SIDES)
         raise ValueError(f"side must be one of {names}, not {side!r}{did_you_mean(side, SIDES)}")
+    # The number of levels that the side needs; any number suits a level set.
     count = 2 if side == "between" else 1 if side in ("below", "above") else len(levels)
     if len(levels) != count:
         raise ValueError(
@@ -217,6 +218,7 @@ def _as_levels(level: Any) -> tuple[Any, ...]:
     if is_tensor(level):
         numbers = tensor_to_array(level, "level")
         backend = backend_of(numbers)
+        # Each level as an array of one lane, which keeps its derivative.
         indices = map(backend.UInt32, range(dr.width(numbers)))
         return tuple(dr.gather(backend.Float, numbers, index) for index in indices)
     is_numpy_row = isinstance(level, np.ndarray) and np.ndim(cast("Any", level)) == 1
@@ -224,6 +226,7 @@ def _as_levels(level: Any) -> tuple[Any, ...]:
         entries: list[Any] = [*level]
         if not entries:
             raise ValueError("level: give at least one")
+        # A tensor among the entries may hold several levels.
         parts = [_as_levels(entry) if is_tensor(entry) else (entry,) for entry in entries]
         return tuple(number for part in parts for number in part)
     return (cast("Any", level),)

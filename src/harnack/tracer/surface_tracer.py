@@ -445,6 +445,7 @@ class SurfaceTracer:
         # the ray starts there.
         occupied, empty_until = None if crosses else self.occupied, start
         if occupied is not None:
+            # Empty intervals become [0, 0]: their ends may be infinite.
             is_nonempty = backend.Bool(active) & (start < end)
             start, end = dr.select(is_nonempty, start, 0), dr.select(is_nonempty, end, 0)
             empty_until = occupied.end_of_empty_run(path.origin, path.direction, start, end)
@@ -503,6 +504,7 @@ class SurfaceTracer:
         never, size = self.backend.Bool(False), max_norm(path.origin)
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
         if self.volume is None:
+            # Nothing is known of levels before the interval and after it.
             return start, end, Hysteresis.of(self.levels, (never, never), start, rounding)
         lowest_start, highest_end = t_min, t_max
         if self.region is not None:
