@@ -315,7 +315,7 @@ class _FarBounds:
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the edge from p to q to the sums of the cells with the centers c.
 
-            inverse: 1/|q - p|^2.
+            inverse: 1/|q - p|^2. (An edge is far if its distance from c is more than `far_from`.)
             state: the smallest squared distance of a far edge; then, summed over the far edges,
                 the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
                 truncation error; then, summed over all edges, a bound of the integral of |dp|/D^2.
@@ -488,6 +488,7 @@ def _cell_records(
     coefficients, margin = far.coefficients.copy(), 1 + _SUM_MARGIN
     # The constant is known modulo 4 pi: the smallest such number is used.
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
+    # rounding: (n, 4) for the value, and for the three derivatives in units of 1/radius.
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
     # 48 is 16 of `LoopEdges.rounding` and 32 of the third part.
     value_rounding = rounding[:, 0] + backend.machine_epsilon * (

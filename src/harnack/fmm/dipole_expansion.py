@@ -123,9 +123,10 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
     """
     # A tree in which each leaf is one triangle, to compute its moments.
     leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
-    level = triangle_tree_moments(leaves, corners)[0]
+    level = triangle_tree_moments(leaves, corners)[0]  # the leaves; it has no other level
     moments, reach = level.moments, TRIANGLE_RATIO * level.radius
     error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
+    # Area times normal, from the moments M_11 and M_10 (`multipole.dipole_moments`).
     normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
     higher = _columns(level, _TRIANGLE_MOMENTS)
     norms = [sup_norm(moments, l) for l in (1, 3, 4)]
@@ -412,8 +413,8 @@ class _ClusterExpansion:
         area: the sum of the areas of its dipoles.
         radius: the radius of the ball.
         """
-        # The points of the ball are farther from the source's center than the gap distance -
-        # radius.
+        # All points of the ball are at least this gap away from the source's center: the distance
+        # of the ball's center, minus the ball's radius.
         distance = dr.rcp(self.inverse)
         inverse_gap = dr.rcp(distance - radius)
         # power: 1/gap^(k+1) for the first degree k that is left out, one more than
@@ -554,8 +555,10 @@ class PendingSources:
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Visit a node of the tree. In a leaf that is not far, count and store the primitives
-            that are sought.
+            """Visit a node of the tree, for a ball with the center c on each lane. In a leaf that is
+            not far, count and store the primitives that are sought: the far ones, or with far=False
+            the near ones. A dipole is far if it is farther than `far_radius` from c. The radius of
+            inner nodes that are entered is more than `max_node_radius`.
 
             node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
             state: a tuple with the number of primitives so far.
@@ -582,16 +585,19 @@ class PendingSources:
                 """Count and store the primitive in a slot of the leaf if it is sought. count: the
                 number so far. Returns the next slot and the new number."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
+                # `store` is None in the pass that only counts.
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)
                 return slot + 1, count + dr.select(chosen, uint_t(1), uint_t(0))
 
+            # The loop's state is the slot and the number of primitives.
             return enters, (
                 dr.while_loop((uint_t(0), state[0]), runs, step, label="primitives")[1],
             )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Count and store primitive i of the ball's list if it is sought.
+            """Count primitive i of the ball's list if it is sought (`is_chosen`), and store its
+            index unless the function `store` is None.
 
             active: the mask of the lanes that have an entry.
             state: a tuple with the number of primitives so far. Returns the new number, in a tuple.
@@ -637,7 +643,8 @@ def _count_nodes(
     uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        """Count a node, and store its index, if it is of the kind that is sought.
+        """Count a node if it is of the kind that is sought: far from the center c of the ball, or
+        with far=False pending. Store its index unless the function `store` is None.
 
         node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
         state: a tuple with the number of nodes so far.

@@ -171,8 +171,9 @@ def _over_pieces(
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
-        """Add the piece of edge j that begins at the parameter t in [0, 1). With its first piece,
-        multiply the product (zr, zi) by the edge's factor.
+        """Add the piece of the ball's far edge j that begins at the parameter t in [0, 1). With its
+        first piece, multiply the product (zr, zi) by the edge's factor. The ball's edges are
+        number `first` to `first` + `count` - 1 in the lists `start` and `end` of their ends.
 
         sums: bounds of the errors, and the coefficients after the first.
 
@@ -270,7 +271,8 @@ class _EdgePiece:
             value_tail, slope_tail = tail_bounds(radius * inverse)
             strength = weight * area * dr.square(inverse)
             rounding = _TERM_ROUNDING * weight * 2 * half * inverse
-            # total: the coefficients of phi, from the irregular harmonics at the node.
+            # total: the coefficients of phi, the potential 1/distance of the piece (see the module),
+            # from the irregular harmonics at the node.
             error = error + rounding + strength * value_tail
             slope = slope + (rounding + strength * slope_tail) / radius
             for key, pair in irregular_harmonics(d.x, d.y, d.z, inverse, DEGREE).items():
@@ -357,8 +359,8 @@ def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> 
 
 
 def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
-    """Compute the coefficients of g from those of phi: g is the integral over s in [0, 1] of
-    e . (u x grad) phi(su)/s.
+    """Compute the coefficients of a piece's solid angle g from those of its potential phi, the mean
+    of 1/distance over its points: g(u) is the integral over s in [0, 1] of e . (u x grad) phi(su)/s.
 
     phi: the coefficients L_jk of phi, as pairs of real and imaginary part by (j, k).
     e: the vector from the start to the end of the edge.

@@ -329,6 +329,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
         s4, s5 = (dr.select(active, bound, 0) for bound in (s4, s5))
         return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).to_state()
 
+    # dr.inf: the distance of the nearest edge before any is added.
     start = SourceSums.zero(backend, dr.inf, derivatives).to_state()
     return SourceSums.from_state(edges.records.for_each(add, start, "rates of edges"))
 

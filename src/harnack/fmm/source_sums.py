@@ -400,6 +400,7 @@ class SourceSums:
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
+        # R is this fraction of the distance to the nearest singular point, less rounding.
         fraction = _TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
         # Without sources s5 is 0 and R may be infinite; then R s5 would be NaN.

@@ -625,7 +625,8 @@ class LiftedTrails:
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """The new state, after the edges in the record `row` have been added. It holds the
             product of factors, the gradient, the least squared distance, the bound of the rounding,
-            s4 and s5."""
+            s4 and s5 (quantities of `SourceSums` that bound the remainder of Taylor's formula)."""
+            # L is the length of an edge, d its distance from x, w c its Biot and Savart field.
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)

@@ -101,8 +101,8 @@ def traverse_clusters(
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
-        """Add the node on lanes on which it is far; on other lanes, add its primitives if it is a
-        leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
+        """Add the node on lanes on which it is far from x: farther than `closer` times its accepting
+        distance. On other lanes, add its primitives if it is a leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
         # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
@@ -410,7 +410,9 @@ class Treecode:
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
-            of the sums and the caller's own state. Returns the new state."""
+            of the sums and the caller's own state. `free_fraction` times the distance of the node's
+            center is the radius of a ball around x that is free of the node's sources. Returns the
+            new state."""
             # The coefficients c[:15] of the moments, and c[15] = E (`node_records`).
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)

@@ -191,7 +191,7 @@ def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatA
     key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
     short_rows = np.flatnonzero(np.isnan(key[:, -1]))
-    # The empty slot is somewhere on the right: move it to the end of the row.
+    # The empty slot, number width - 1, is somewhere on the right: move it to the end of the row.
     empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
     order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
     # A short row of odd width 2m + 1 has 2m points, and its left half has m + 1 slots. The last of
@@ -306,7 +306,7 @@ def pack_tree(
         # Minus the first child; for leaves it is replaced below.
         heads[index, _CALLER_NUMBERS + 1] = -first_child
         payloads[index] = values[:, _CALLER_NUMBERS:]
-    leaves = links[0][0]
+    leaves = links[0][0]  # the indices of the nodes at level 0
     heads[leaves, _CALLER_NUMBERS + 1] = np.arange(len(leaves))
     return PackedTree(
         backend,

@@ -445,6 +445,8 @@ class ClosestPointOnTriangle:
         alpha, away = _project_on_edge(-a, e, inverse)
         beta, h = _project_on_edge(of_longest(r, p, q) - a, e, inverse)
         s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
+        # s: how high x is projected, as a fraction of the triangle's height. There, the triangle
+        # reaches along the edge from s beta to 1 - s (1 - beta).
         is_inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
         # From x to the closest point of the plane.
         across = dr.fma(vector(s), h, -away)

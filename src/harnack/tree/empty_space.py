@@ -476,7 +476,7 @@ class OccupancyGrid(GridData):
         """
         x, y, z = self.shape
         is_occupied = (self.empty_distance == 0).reshape(z, y, x)
-        indices = np.argwhere(is_occupied)[:, ::-1]
+        indices = np.argwhere(is_occupied)[:, ::-1]  # as (x, y, z)
         halves = BoxCells(
             self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()
