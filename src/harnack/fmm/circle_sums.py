@@ -286,8 +286,8 @@ class CircleSet:
             lower_end = dr.select(
                 circle.r < 1, dr.select(is_above, real(-4 * math.pi), 0), -2 * math.pi
             )
-            # The integral of |dp|/D^2 is 2 pi/(nearest farthest a); that of |dp|/D^4 is at most that
-            # of |dp|/D^3 over the least distance, nearest a.
+            # The integral of |dp|/D^2 is 2 pi/(nearest farthest a). That of |dp|/D^4 is at most the
+            # integral of |dp|/D^3 over the least distance, nearest a.
             return (
                 angle + circle.angle,
                 gradient,

@@ -300,7 +300,8 @@ class CurveCells:
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
             """Add the near edges in record i of the cell; `count` is the number of these records.
-            An edge of the curve adds to `rates`, the bounds for all `lengths` (`add_edge_rates`). A closing edge adds its Biot and Savart field to `field`.
+            An edge of the curve adds to `rates`, the bounds for all `lengths` (`add_edge_rates`). A
+            closing edge adds its Biot and Savart field to `field`.
 
             p: the vertex before the record.
 

@@ -555,10 +555,10 @@ class PendingSources:
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Visit a node of the tree, for a ball with the center c on each lane. In a leaf that is
-            not far, count and store the primitives that are sought: the far ones, or with far=False
-            the near ones. A dipole is far if it is farther than `far_radius` from c. The radius of
-            inner nodes that are entered is more than `max_node_radius`.
+            """Visit a node of the tree, for a ball with the center c on each lane. In a leaf that
+            is not far, count and store the primitives that are sought: the far ones, or with
+            far=False the near ones. A dipole is far if it is farther than `far_radius` from c. Only
+            inner nodes with a radius of more than `max_node_radius` are entered.
 
             node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
             state: a tuple with the number of primitives so far.

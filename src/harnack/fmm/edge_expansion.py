@@ -271,8 +271,8 @@ class _EdgePiece:
             value_tail, slope_tail = tail_bounds(radius * inverse)
             strength = weight * area * dr.square(inverse)
             rounding = _TERM_ROUNDING * weight * 2 * half * inverse
-            # total: the coefficients of phi, the potential 1/distance of the piece (see the module),
-            # from the irregular harmonics at the node.
+            # total: the coefficients of phi, the mean of 1/distance over the piece (see the
+            # module), from the irregular harmonics at the node.
             error = error + rounding + strength * value_tail
             slope = slope + (rounding + strength * slope_tail) / radius
             for key, pair in irregular_harmonics(d.x, d.y, d.z, inverse, DEGREE).items():
@@ -360,7 +360,8 @@ def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> 
 
 def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
     """Compute the coefficients of a piece's solid angle g from those of its potential phi, the mean
-    of 1/distance over its points: g(u) is the integral over s in [0, 1] of e . (u x grad) phi(su)/s.
+    of 1/distance over its points. g(u) is the integral over s in [0, 1] of
+    e . (u x grad) phi(su)/s.
 
     phi: the coefficients L_jk of phi, as pairs of real and imaginary part by (j, k).
     e: the vector from the start to the end of the edge.

@@ -107,7 +107,8 @@ class PointValues:
         # Nearer than 4 the second error does not matter, so |x| counts as at least 4.
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
         moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
-        # `inverse` is 1/r with r = |x|. Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and 24 are larger, to spare.
+        # `inverse` is 1/r with r = |x|. Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and
+        # 24 are larger, to spare.
         return dataclasses.replace(
             self,
             error=self.error + underflow + moment_error,

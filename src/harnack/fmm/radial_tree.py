@@ -307,10 +307,11 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
-    # count: the number of nodes at a level. Leaves have no children: the first arity, 0, is not used.
+    # count: the number of nodes at a level. Leaves have no children: the first arity, 0, is not
+    # used.
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
-        # Positions, moments and weights, each (count, dipoles below a node, ...): the columns 0 to 2,
-        # 3 to 5, and 6 of the records.
+        # Positions, moments and weights, each (count, dipoles below a node, ...): the columns 0 to
+        # 2, 3 to 5, and 6 of the records.
         position, moment, weights = np.split(
             slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2
         )

@@ -101,8 +101,9 @@ def traverse_clusters(
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
-        """Add the node on lanes on which it is far from x: farther than `closer` times its accepting
-        distance. On other lanes, add its primitives if it is a leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
+        """Add the node on lanes on which it is far from x: farther than `closer` times its
+        accepting distance. On other lanes, add its primitives if it is a leaf. Returns the mask of
+        the lanes on which the walk enters the node, and the new state."""
         # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square

@@ -568,8 +568,8 @@ def _crossing_depth(
     max_w = fmin(
         (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
     )
-    # w: the area at the longest edge over the triangle's area. The edge ac is run from c to a, hence
-    # the minus sign.
+    # w: the area at the longest edge over the triangle's area. The triangle runs the edge ac from c
+    # to a, hence the minus sign.
     w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, apex_position, ray_position), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))

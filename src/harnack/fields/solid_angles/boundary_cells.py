@@ -169,6 +169,7 @@ class BoundaryCells:
         cell_sums, inside = self.cells.sums(x, active)
         displacement = x - cell_sums.center
         distance = dr.norm(displacement)
+        # At the center itself the line to x has no direction.
         inside &= distance > _TRIANGLE_ROUNDINGS * unit
         direction = dr.select(inside, displacement / distance, backend.Array3f(0, 0, 1))
         frame = RayFrame.along(backend, cell_sums.center, direction)

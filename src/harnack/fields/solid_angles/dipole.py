@@ -111,7 +111,7 @@ class DipoleTree:
         build: a function that builds cells from the moments of the tree's nodes and the records of
             the dipoles (in NumPy, and on the backend); None for no cells.
         """
-        # Each dipole is a source with one position and one moment, and its own center.
+        # Each primitive is a single dipole, and its box is the dipole's position.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
         # Column 6 is |m_i|; the rounding is proportional to the size of the sum.
@@ -378,7 +378,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.fit_report: dict[str, Any] = {}
         if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
-            # What `replace` changes is the denoised cloud.
+            # `replace` makes a changed field from the recorded arguments: those of the denoised
+            # cloud.
             record_arguments(self, normals=normals, smoothing=smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)

@@ -127,6 +127,7 @@ class SlicedKernel(RadialKernel):
         """
         del distance
         # c = w/D, s2 = (r/D)^2; moment: i_(k+1), from k = last down; theta_k = psi_k D^(2k+1).
+        # `inverse` in the result is the factor 1/D that all psi_k have in common, beside 1/D^(2k).
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
         moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
@@ -247,6 +248,7 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
         of space and face the same way are merged: they get a single point.
     """
     # A kind of triangles that does not occur has no part.
+    # The ratios bound, for each point, moments of its group relative to |m|: the largest count.
     is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
         make_points(triangles, longest)
@@ -314,7 +316,8 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
         middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
-    # A piece is 1/count times as large as its triangle, in all lengths.
+    # A piece is 1/count times as large as its triangle, in all lengths. The integral of |d|^2 over
+    # |m| is the mean of |d|^2 over the piece, as |m| is its area.
     second_ratio = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_corner_distances(corners, corners.mean(axis=1)) / counts).max())
     return QuadraturePoints(
@@ -416,8 +419,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         super().__init__()
         self.heights = (w, gap - w)  # of the slice above mesh a, and below mesh b
         self.spacing, self.accuracy = spacing, accuracy
-        low = np.min([pair.min(axis=(0, 1)) for pair in corners], axis=0)
-        high = np.max([pair.max(axis=(0, 1)) for pair in corners], axis=0)
+        # corners: (m, 3, 3) for each of the two meshes.
+        low = np.min([mesh.min(axis=(0, 1)) for mesh in corners], axis=0)
+        high = np.max([mesh.max(axis=(0, 1)) for mesh in corners], axis=0)
         self._box = low, high
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
@@ -428,7 +432,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._pieces = tuple(
             quadrature_points(*pair) for pair in zip(corners, longest, strict=True)
         )
-        self._dipoles = tuple(self._dipole_tree(pair) for pair in self._pieces)
+        self._dipoles = tuple(self._dipole_tree(points) for points in self._pieces)
         self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 

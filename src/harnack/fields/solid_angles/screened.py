@@ -105,6 +105,7 @@ class YukawaKernel(RadialKernel):
         """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
+        # First the factor that all psi_k have in common, beside the powers 1/rho^(2k).
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:

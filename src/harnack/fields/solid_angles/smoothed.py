@@ -78,6 +78,7 @@ class SmoothedKernel(RadialKernel):
         for k in range(last + 1):
             thetas.append(dr.fma((2 * k + 1) * double_factorial, half_q, double_factorial))
             double_factorial *= 2 * k + 1
+        # First the factor that all psi_k have in common, beside the powers 1/D^(2k).
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:

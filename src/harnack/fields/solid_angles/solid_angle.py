@@ -544,7 +544,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
         data = self._data_for(p)
         if self._all_cancel:
-            return 0 * p.x
+            return 0 * p.x  # f is constant: 0 on each lane
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
         sums = data.sums(x)

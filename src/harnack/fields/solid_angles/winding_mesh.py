@@ -80,7 +80,7 @@ class WindingMesh:
             raise MeshError(
                 f"faces: at most {MAX_TRIANGLES - 1} are possible; cut the mesh in parts"
             )
-        # A singular edge occurs as often as its weight says.
+        # In the order of the attributes. A singular edge occurs as often as its weight says.
         return cls(
             x,
             net.faces,
