@@ -315,7 +315,10 @@ class _FarBounds:
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the edge from p to q to the sums of the cells with the centers c.
 
-            inverse: 1/|q - p|^2. (An edge is far if its distance from c is more than `far_from`.)
+            An edge is far if its distance from c is more than `far_from`. `ball_radius` is the
+            radius of the cells' balls.
+
+            inverse: 1/|q - p|^2.
             state: the smallest squared distance of a far edge; then, summed over the far edges,
                 the integral of |dp|/D^3, the gradient of this integral, and an estimate of the
                 truncation error; then, summed over all edges, a bound of the integral of |dp|/D^2.

@@ -190,9 +190,9 @@ class DipoleCells:
             return i < count
 
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
-            """Add near primitive number i of the cell to the sums, given as a tuple of arrays, and
-            update `extra_state`, the state of the caller. Returns i + 1, the new sums and the new
-            state of the caller."""
+            """Add near primitive number i of the cell to the sums, given as a tuple of arrays, by
+            the caller's function `add`, which also updates `extra_state`, the state of the caller.
+            Returns i + 1, the new sums and the new state of the caller."""
             # The list of each lane's cell: `count` entries of `self.near`, from `first` on. Other
             # lanes in the loop have longer lists.
             in_list = i < count

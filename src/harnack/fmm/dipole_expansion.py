@@ -222,8 +222,9 @@ class DipoleExpansions:
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """Compute what node i adds to the attributes of `DipoleExpansions`, in their order, as
-            a flat list of numbers. active: the mask of the lanes that have this node."""
+            """Compute what node i of the tree adds to the attributes of `DipoleExpansions`, for
+            balls with the centers c, in the order of the attributes, as a flat list of numbers.
+            active: the mask of the lanes that have this node."""
             # The record of the node, in the order of `source_tree`.
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             moments = dict(zip(_MOMENTS, payload, strict=False))
@@ -248,9 +249,9 @@ class DipoleExpansions:
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """Compute what primitive i, a dipole or a triangle, adds to the attributes of
-            `DipoleExpansions`, in their order, as a flat list of numbers. active: the mask of the
-            lanes that have this primitive."""
+            """Compute what primitive i of the tree, a dipole or a triangle, adds to the attributes
+            of `DipoleExpansions`, for balls with the centers c, in the order of the attributes, as
+            a flat list of numbers. active: the mask of the lanes that have this primitive."""
             # row: position, area times normal, area; of a triangle all of `triangle_sources`.
             row = tree.primitives.read_record(i, active)
             # The moments of degree 1, from area times normal.
@@ -567,12 +568,13 @@ class PendingSources:
             """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
-            # Only nodes whose ball comes near have near dipoles; the radius (head[4]) is increased
+            # If the primitives are dipoles (`are_points`), only nodes whose ball comes near have
+            # near ones; the radius (head[4]) is increased
             # a little against rounding.
             if are_points and not far:
                 enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > max_node_radius)
-            # Lanes that have counted enough stop.
+            # Lanes that have counted enough stop; `count_limit` is None for no such limit.
             if count_limit is not None:
                 enters &= state[0] <= count_limit
 
@@ -644,7 +646,8 @@ def _count_nodes(
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
         """Count a node if it is of the kind that is sought: far from the center c of the ball, or
-        with far=False pending. Store its index unless the function `store` is None.
+        with far=False pending: not far, no leaf, and of a radius of at most `max_node_radius`.
+        Store its index unless the function `store` is None.
 
         node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
         state: a tuple with the number of nodes so far.

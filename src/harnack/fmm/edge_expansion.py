@@ -172,8 +172,9 @@ def _over_pieces(
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
         """Add the piece of the ball's far edge j that begins at the parameter t in [0, 1). With its
-        first piece, multiply the product (zr, zi) by the edge's factor. The ball's edges are
-        number `first` to `first` + `count` - 1 in the lists `start` and `end` of their ends.
+        first piece, multiply the product (zr, zi) by the edge's factor. The ball has the center c.
+        Its edges are number `first` to `first` + `count` - 1 in the lists `start` and `end`, which
+        hold the rows of their ends in `points`.
 
         sums: bounds of the errors, and the coefficients after the first.
 

@@ -204,8 +204,8 @@ def dipole_tree_moments(
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """Read the dipoles and the box of primitive i from the buffers of positions p, normals n,
-        and the boxes' corners. i may differ from lane to lane."""
+        """Read the dipoles, `each` of them, and the box of primitive i from the buffers of
+        positions p, normals n, and corners `lows` and `highs`. i may differ from lane to lane."""
         # 1: the whole area of a dipole is at its single point.
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
@@ -312,7 +312,8 @@ def _leaf_moments(
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Loop over the primitives of each leaf, one after another, and for each of them set state
-        = body(primitive, *state). Returns the last state."""
+        = body(primitive, *state). The leaf's primitives are the entries `first` to `end` - 1 of
+        `slots`. Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
             """Update the state by the primitive in a slot. Returns the next slot, and then the new

@@ -101,9 +101,11 @@ def traverse_clusters(
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
-        """Add the node on lanes on which it is far from x: farther than `closer` times its
-        accepting distance. On other lanes, add its primitives if it is a leaf. Returns the mask of
-        the lanes on which the walk enters the node, and the new state."""
+        """Add the node, by the function `add_cluster`, on lanes on which it is far from x: farther
+        than `closer` times its accepting distance. On other lanes, if it is a leaf, add its
+        primitives by the function `add_primitive`. `height_square` is added to all squared
+        distances. Returns the mask of the lanes on which the walk enters the node, and the new
+        state."""
         # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square

@@ -361,8 +361,8 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> LoopValues:
-        """Visit node i. Returns the index of the node to visit next, which is its first child or
-        the node after its subtree, and then the new state."""
+        """Visit node i of the tree. Returns the index of the node to visit next, which is its first
+        child or the node after its subtree, and then the new state."""
         head = tree.head(i)
         # head[6]: the node after the subtree. head[7]: the number of the leaf, or minus the index
         # of the first child. The root is nobody's child, so that this is never -0.

@@ -208,7 +208,9 @@ def _next_in_plane(
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """The new state: the number of the face in the record `row` if this face is sought and its
-        number is lower than `state`, the lowest so far; otherwise `state`."""
+        number is lower than `state`, the lowest so far; otherwise `state`. A face is sought if its
+        number is above `after`, it is larger than the lane's face (with the corners `corners` and
+        the size `size`), lies in its plane and overlaps it."""
         # The number -1 of an empty slot is no index; such a slot is never chosen.
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)

@@ -596,8 +596,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
         ) -> DipoleCells | None:
-            """Return the cells that were built before, or build them. Returns None if they would
-            take too much memory.
+            """Return the cells of the cube [-half, half]^3 that were built before, or build them.
+            Returns None if they would take too much memory.
 
             levels: the multipole moments of the tree's nodes, one entry for each level of the tree.
             rows: the records of the dipoles, in the slots of the tree's leaves.

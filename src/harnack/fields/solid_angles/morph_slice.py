@@ -177,7 +177,7 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
         """Compute the values of i_n at x = 2c - 1. x: (k,) numbers in [-1, 1].
 
         With c = cos phi, i_n is phi/sin phi times the integral over t in [0, 1] of
-        (sin(phi t)/sin phi)^(2n-2).
+        (sin(phi t)/sin phi)^(2n-2). `t` and `weight` are the nodes and weights of Gauss's rule.
         """
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)

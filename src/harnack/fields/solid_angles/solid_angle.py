@@ -908,8 +908,8 @@ def _line_bounds(
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
         """For each length T in `lengths`, a bound of |df/ds| at the points x + s v of the line with
-        |s| <= T, summed over edges and circles. Returns one bound for each length. It is infinite
-        on lanes that are not active."""
+        |s| <= T, summed over the edges and circles of the curve `data`. Returns one bound for each
+        length. It is infinite on lanes that are not active."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))
