@@ -157,6 +157,7 @@ class _CurveCellBuilder:
         # octant's center is half of the half side from the cell's center along each axis, and the
         # ball's radius is sqrt(3) BALL_MARGIN half sides: hence the offset in units of the radius.
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
+        # The first depth has one cell, the cube.
         centers, runs, far = (
             self.middle[None],
             EdgeRuns.of_loops(self.vertices),

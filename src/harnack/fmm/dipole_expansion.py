@@ -662,4 +662,5 @@ def _count_nodes(
             store(state[0], node.index, chosen)
         return ~(is_far | is_pending), (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
 
+    # The state has one entry, the number of nodes.
     return traverse_subtrees(tree, lists, visit, (uint_t(0),))[0]

@@ -355,6 +355,7 @@ def dipole_source(
     terms = combine_terms(
         [part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives
     )
+    # `kernel.bounds` returns Q_2 and Q_3.
     return SourceAtPoint(
         terms, row[6], KernelBounds.of(distance, inverse, kernel.bounds(distance, 3))
     )

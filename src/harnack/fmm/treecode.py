@@ -374,6 +374,7 @@ class Treecode:
             )
             nodes.append(node_records(level, order, coarse_ratio, error))
         packed = pack_tree(backend, tree, nodes, primitives)
+        # The factors 1 + 1e-6 are for the rounding to single precision.
         ratios = error_ratio, slope_ratio * (1 + 1e-6), second_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
         return cls(backend, packed, accuracy, coarse_ratio, order, *uploaded)

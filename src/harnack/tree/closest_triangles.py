@@ -291,6 +291,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         del square
         return slot < tree.leaf_size
 
+    # The state is the slot and the smallest squared distance.
     return dr.while_loop((index(0), real(dr.inf)), has_slots, add, label="points of a leaf")[1]
 
 

@@ -436,7 +436,7 @@ class OccupancyGrid(GridData):
         """
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
-        cell = round_to_short_float(cell)
+        cell = round_to_short_float(cell)  # single precision has its small multiples exactly
         # For rounding the corner down, and for the margin beyond the box.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))

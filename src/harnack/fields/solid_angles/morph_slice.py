@@ -600,7 +600,7 @@ class _SliceBuffers(UnitFrame):
         detail: the accuracy scale; larger is more accurate.
         """
         x = self.to_unit(p)
-        radial = self.sums(x, detail, 1)
+        radial = self.sums(x, detail, 1)  # 1: with gradients
         sums = radial.sums
         # Of the rounding of positions (s4 is a sum that bounds it), and of truncation.
         slope_error = dr.fma(

@@ -471,6 +471,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         detail: the accuracy scale; larger is more accurate.
         """
         x = on.to_unit(p)
+        # 1: with gradients.
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)
         cutoff, slope, _ = self._cutoff_errors(on, sums, unit)
@@ -523,7 +524,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             t = self._kappa * distance
             may_have_level = total * (1 + t) * math.exp(-t) > min_level * distance * distance
             low, high = (distance, high) if may_have_level else (low, distance)
-        distance = 1.001 * high * self._size
+        distance = 1.001 * high * self._size  # a little larger, for rounding
         lower, upper = self.points.min(axis=0) - distance, self.points.max(axis=0) + distance
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 

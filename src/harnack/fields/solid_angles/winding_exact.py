@@ -125,6 +125,7 @@ class ExactWinding:
         value = ray_sign * (turns + edge_turns)
         dr.eval(value, is_uncertain)
         uncertain_ids = dr.compress(is_uncertain)
+        # 0: without derivatives.
         if len(uncertain_ids):
             dr.scatter(
                 value, self.values(dr.gather(type(x), x, uncertain_ids), 0).value, uncertain_ids

@@ -377,6 +377,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
+                # Second derivatives from the edges, and only the value from the tree.
                 rates = self._boundary_rates(data, winding).at(x, 2, closer)
                 values = with_rates(winding.values(x, 0, closer), rates)
             else:
