@@ -476,8 +476,7 @@ class PendingSources:
         tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         radius: the radius of the balls.
-        factor: the number k of the module docstring: a dipole is far if it is farther than `factor`
-            radii from the center of the ball.
+        factor: a dipole is far if it is farther than `factor` radii from the center of the ball.
         max_node_radius: an inner node that is not far remains a node if its radius is at most this.
             A larger one is replaced by its children, and a leaf by its primitives, each of which
             is far or near by itself.

@@ -288,8 +288,9 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
 
     q: rho/|d|.
 
-    Returns two numbers. Let S be the sum of all terms of degree above p = DEGREE of the edge's
-    function g (see the module). Anywhere in the ball |S| is at most the first number times |d x
+    Returns two numbers. The solid angle at c + u minus that at the center c is the sum of a
+    function g(u) of each edge. Let S be the sum of all terms of degree above p = DEGREE of the
+    edge's g. Anywhere in the ball |S| is at most the first number times |d x
     dp|/|d|^2, and rho |grad S| is at most the second number times |d x dp|/|d|^2.
 
     Proof. For a point u of the ball, phi = sum over j of |u|^j P_j(s)/|d|^(j+1), with s the cosine

@@ -207,7 +207,8 @@ def cluster_source(
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
     """What a cluster of dipoles adds at a point to the sum f: value and derivatives, with bounds of
-    their truncation errors. The formulas are those of the module.
+    their truncation errors. The cluster's potential is replaced by its Taylor polynomial of degree
+    2 in the dipoles' offsets from the center.
 
     head: the first six numbers of the cluster's record: center, accepting distance, radius, weight.
     c: the other numbers of its record: 23 coefficients, and the third moment (`node_records`).

@@ -414,7 +414,8 @@ class SourceSums:
 
     def remainder(self, b: float, r: Real) -> Real:
         """The number K such that f differs from its linear part by at most K t^2 at any distance t
-        <= r from x: K = 3 s4 + rise r s5, with the symbols of `sample`.
+        <= r from x: K = 3 s4 + rise r s5. Here rise is the slope of the chord over [0, b] of
+        (3 - 2q)/(1 - q)^2 (`sample` has the proof).
 
         b: the largest ratio of t to the distance of a source from x.
         r: b times the distance to the nearest singular point, or less.

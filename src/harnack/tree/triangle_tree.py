@@ -286,10 +286,12 @@ class TriangleTree:
             t, new_sign = signed_crossing(row, frame)
             # The triangle of an empty slot, number -1, has no area: its sign is 0.
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
+            # After NO_TRIANGLE no triangle is left at the same t.
             is_after = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             is_before_best = (t < best) | ((t == best) & (n < number))
             is_crossed = new_sign != 0
             if reach > 0:
+                # A border near an end of the ray does not count.
                 is_off_ends = (t > 2 * reach) & (t < t_max - 2 * reach)
                 is_crossed |= is_off_ends & _is_beside(row, frame, reach)
             is_chosen = active & is_crossed & is_after & is_before_best & (t <= t_max)

@@ -117,9 +117,10 @@ class SlicedKernel(RadialKernel):
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         """Compute the functions psi_0, ..., psi_last at a distance D in four dimensions. psi_k is a
-        constant times i_(k+1)/D^(2k+1), with the integrals i_n of the class docstring. The integral
-        with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
-        i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
+        constant times i_(k+1)/D^(2k+1). Here i_n is D^(2n-1) times the integral of
+        dv/(r^2 + v^2)^n over v from w to infinity, a function of c = w/D. The integral with the
+        largest n comes from a polynomial, and all others from the recurrence
+        i_n = (2n s^2 i_(n+1) + c)/(2n-1), where s = r/D.
 
         distance: D; not used.
         inverse: 1/D.
@@ -162,7 +163,7 @@ class SlicedKernel(RadialKernel):
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """Fit a polynomial to the integral i_n(c) of `SlicedKernel` for c in [0, 1].
+    """Fit a polynomial to the integral i_n(c) of `SlicedKernel.at` for c in [0, 1].
 
     n: the index of the integral.
     degree: the degree of the polynomial, whose variable is 2c - 1.

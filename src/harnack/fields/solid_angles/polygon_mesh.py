@@ -480,7 +480,8 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     over_relaxation: float = 1.3  # as for `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
-        """Validate vertices and faces. The parameters are described at the class."""
+        """Validate vertices (n, 3) and faces, a list of polygons: each is a list of indices of
+        vertices, or a list of such loops."""
         super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.face_count >= MAX_BOXES:

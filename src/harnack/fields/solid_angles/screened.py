@@ -316,8 +316,14 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         accuracy: float = 6.0,
     ) -> None:
         """Validate the points, choose the method, scale the points to unit coordinates, and compute
-        the default level. The parameters (points, normals, areas, length, method, accuracy) are
-        described at the class."""
+        the default level.
+
+        points, normals: (n, 3), normals of any length.
+        areas: (n,) the areas that the points stand for; None estimates them.
+        length: the screening length.
+        method: "sum" (all dipoles), "tree" (clusters of far dipoles), or "auto".
+        accuracy: for the tree; larger is more accurate.
+        """
         super().__init__()
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):

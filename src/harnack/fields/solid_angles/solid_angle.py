@@ -154,7 +154,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         cells: bool | float | None = None,
     ) -> None:
         """Validate the curve, remove edges that cancel each other, and decide how the range of the
-        lift is bounded. The parameters (loops, lift_bound, cells) are described at the class."""
+        lift is bounded.
+
+        loops: the closed curves: arrays (n, 3) of vertices, or circles; one of them or a list.
+        lift_bound: the way in which that range is bounded ("auto" to choose).
+        cells: whether to build FMM cells: True, False, None if they save time, or the number of
+            megabytes that they may take.
+        """
         super().__init__()
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
