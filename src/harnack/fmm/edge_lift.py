@@ -80,8 +80,8 @@ class LiftedEdges:
             w times.
         """
         table = edge_records(vertices, edges)
-        # Loops over the records take `_EDGES_PER_TRIP` in each trip; the last trip is filled up with
-        # an edge from a vertex to itself, with direction 0, which adds nothing.
+        # Loops over the records take `_EDGES_PER_TRIP` in each trip. The last trip is filled up
+        # with an edge from a vertex to itself, with direction 0, which adds nothing.
         padding = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
         return cls(RecordTable.upload(backend, table, padding, _EDGES_PER_TRIP))
 
