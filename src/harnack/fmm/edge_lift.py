@@ -265,6 +265,7 @@ class LiftedSums:
         rounding, s4, s5 = edge.bounds(unit)
         # On other lanes the product is multiplied by 1; scaling it again may round it.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
+        # edge.edge: the positions of the ends relative to the point.
         distance = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
             sums,

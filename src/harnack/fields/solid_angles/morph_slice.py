@@ -184,6 +184,7 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
 
+    # The nodes lie inside of (-1, 1), so that phi is not 0.
     nodes = chebyshev.chebpts1(2 * degree)
     series = chebyshev.chebfit(nodes, moment(nodes), degree)
     return tuple(float(coefficient) for coefficient in chebyshev.cheb2poly(series))
@@ -607,8 +608,9 @@ class _SliceBuffers(UnitFrame):
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
-        # A lower bound of the distance, in four dimensions, to the nearest quadrature point; and
-        # the range of f on the ball around x of radius r.
+        # A lower bound of the distance, in four dimensions, to the nearest quadrature point, also
+        # after rounding; and the range of f on the ball around x of radius r, a ball in four
+        # dimensions, in which f is harmonic.
         nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
         r = BALL_FRACTION * nearest
