@@ -130,6 +130,7 @@ class Formula(Field):
         distances, as for the library's shapes. Then small numbers in the formula are mere lengths,
         and 1 is taken in place of the smallest number, so that only large numbers make f abrupt.
         """
+        # self.lipschitz: the stated Lipschitz constant of f, or None.
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
     def evaluate(self, p: Vec3) -> Sample:

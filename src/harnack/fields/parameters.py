@@ -315,8 +315,8 @@ def _exchanged(value: Any, changes: dict[str, Any]) -> Any:
 
 
 def _in_form_of(old: Any, new: Any) -> Any:
-    """The value `new`. If it is an array that replaces a list or tuple of numbers, `old`, it is made
-    a list or tuple, too."""
+    """The value `new`. If it is an array that replaces a list or tuple of numbers, `old`, it is
+    made a list or tuple, too."""
     if not isinstance(new, np.ndarray) or not _is_nested_numbers(old):
         return cast("Any", new)
 

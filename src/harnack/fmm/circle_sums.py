@@ -173,7 +173,7 @@ class UnitCircle:
         r, z = self.r, self.z
         a_sum = dr.fma(r, r, dr.fma(z, z, 1))  # A
         j = self.share * self.share * self.radial  # J: `radial` is J/share^2
-        distance_product = self.nearest * self.farthest
+        distance_product = self.nearest * self.farthest  # Rm Rp
         c5 = 2 * self.third + a_sum * j / 3  # (Rm Rp)^2 C5/r
         z_ratio, r_ratio = z / distance_product, r / distance_product
         # fifth_difference = I5 - r C5. As I5 = (I3 + 2 r C5)/A, it is (I3 + (2 - A) r C5)/A.

@@ -174,7 +174,8 @@ class _CurveCellBuilder:
             # The index of the first cell of this depth that is not split, and of the first that is.
             self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
             split_count += len(split)
-            # self.size: the number of bytes so far.
+            # self.size: the number of bytes so far. self.leaves: the number of cells so far that
+            # are not split.
             if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
                 return False
             if not len(split):

@@ -398,7 +398,9 @@ class _ParentExpansions:
     def of(self, cells: IntArray) -> DipoleExpansions:
         """Compute the expansions that the cells with these indices inherit, about their own
         centers."""
-        if not self.radius:  # the root inherits nothing: `sums` is zero
+        # self.sums: the expansions of the parents. self.radius: the radius of their balls; 0 for
+        # the root, which inherits nothing: `sums` is zero.
+        if not self.radius:
             return self.sums
         parents, parent_index = np.unique(cells // 8, return_inverse=True)
         octants = self.sums.subset(parents).to_octants(self.shifts, self.radius)

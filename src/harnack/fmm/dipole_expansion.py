@@ -414,6 +414,7 @@ class _ClusterExpansion:
         area: the sum of the areas of its dipoles.
         radius: the radius of the ball.
         """
+        # self.inverse: one over the distance of the source's center from the ball's center.
         # All points of the ball are at least this gap away from the source's center: the distance
         # of the ball's center, minus the ball's radius.
         distance = dr.rcp(self.inverse)

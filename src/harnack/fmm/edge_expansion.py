@@ -259,6 +259,8 @@ class _EdgePiece:
         2^14 |e|/D (tests compute it), with D the distance of a node of Gauss's rule from the
         center. So the value, and the gradient times the radius, are off by at most 2^-29 |e|/D.
         """
+        # self.e: the vector from the start to the end of the piece. self.middle: its middle,
+        # relative to the center of the ball.
         half = 0.5 * dr.norm(self.e)
         area = dr.norm(dr.cross(self.middle, self.e))
         error, slope = _quadrature_errors(dr.norm(self.middle) - radius, half, area, radius)

@@ -143,7 +143,8 @@ class LiftedEdge:
     def factor(self) -> tuple[Real, Real]:
         """Compute the real and the imaginary part of the edge's factor F_e, a complex number whose
         argument is half the solid angle of the edge's triangle."""
-        # a, b: the ends relative to x, as two coordinates across the ray and one along it.
+        # a, b: the ends relative to x, as two coordinates across the ray and one along it, in the
+        # frame of the ray.
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)

@@ -111,7 +111,9 @@ class SourceTerm:
 class SourceSums:
     """The sums over all sources (dipoles, edges and far nodes of a tree) at points x, one point in
     each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
-    follow.
+    follow. These numbers are the distance to the nearest singular point (a dipole or a point of an
+    edge), and s4 and s5: the sums of a/rho^4 and a/rho^5 over all sources, with the area a of a
+    source and its distance rho.
 
     total: the sum of the values as it was rounded. The property `value` adds `compensation` to it.
     gradient: (3,) of f; None if it was not requested.

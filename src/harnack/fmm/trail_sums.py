@@ -306,8 +306,8 @@ class _AngleProduct:
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
-        # -1 if the sign of y changes, else 0. The number ANDed with it is -1 for a factor that
-        # turns back, else 1.
+        # `half` counts half planes. sign_change: -1 if the sign of y changes, else 0. The number
+        # ANDed with it is -1 for a factor that turns back, else 1.
         sign_change = bits.sign(self.y) ^ bits.sign(y)
         return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 

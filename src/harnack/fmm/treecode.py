@@ -451,7 +451,9 @@ class Treecode:
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
-        # The loop has added up error bounds without the ratios, which are the same for all nodes.
+        # The loop has added up error bounds without the ratios, which are the same for all nodes:
+        # self.gradient_error_ratio and self.hessian_error_ratio are those of the errors of the
+        # derivatives to the error of the value.
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,

@@ -96,7 +96,9 @@ class BalancedTree:
         visited together, lie side by side in memory. A leaf has no children: the index of its first
         child is given as 0, which is the index of the root.
         """
-        below = [0]  # the number of nodes below a node, for each level
+        # self.arities: the number of children of a node at each level, from the parents of the
+        # leaves to the root. below: the number of nodes below a node, for each level.
+        below = [0]
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         # The root has the index 0, its first child 1. From there, level by level downwards.

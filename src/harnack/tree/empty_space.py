@@ -372,6 +372,7 @@ class GridCell:
         The path may leave the cube through a face on which the grid ends, since points outside of
         the grid are treated like the nearest cell. So the length may be infinite.
         """
+        # self.corner: the lower corner of the point's cell.
         length: Real = self.grid.backend.Float(dr.inf)
         margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):

@@ -164,7 +164,8 @@ class BoundaryCells:
         roundings of x.
         """
         # cell_sums: the sums in the cell of x. turns: the number of triangles that the line from
-        # its center to x crosses, counted with signs. value: w modulo 1.
+        # its center to x crosses, counted with signs. value: w modulo 1. self.rays: the tree of the
+        # mesh's triangles. self.center_values: w at the centers of the cells.
         backend, real = self.cells.backend, self.cells.backend.Float
         cell_sums, inside = self.cells.sums(x, active)
         displacement = x - cell_sums.center

@@ -153,6 +153,7 @@ class DipoleTree:
         Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
         one by one, and not by the moments of a node.
         """
+        # self.clusters: the tree with its multipole moments.
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, state[0]

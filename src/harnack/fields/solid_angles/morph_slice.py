@@ -591,6 +591,7 @@ class _SliceBuffers(UnitFrame):
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         sums = RadialSums.zero(self.backend, derivatives)
+        # A cloud is the sum over the quadrature points of one mesh.
         for cloud in self.clouds:
             sums = cloud.accumulate(sums, x, closer)
         return sums

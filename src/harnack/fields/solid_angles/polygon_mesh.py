@@ -117,7 +117,7 @@ class FaceLoops:
     def face(self, index: Any) -> FaceSolidAngle:
         """The solid angle of the face with this index, as a field. The index may differ from lane
         to lane."""
-        row = self.heads.read_record(index)
+        row = self.heads.read_record(index)  # self.heads: one record for each face
         backend = self.heads.backend
         integer = backend.UInt32
         # The columns of `upload`: center, size, index of the first record, signed number of

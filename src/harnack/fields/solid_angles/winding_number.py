@@ -630,7 +630,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
 
 class _TriangleJumps(Jumps):
-    """The triangles of a mesh, across which its winding number w jumps by an integer.
+    """The triangles of a mesh, across which its winding number w jumps by an integer. `data_for`
+    returns the mesh on the device of points p, in unit coordinates.
 
     field: the winding number.
     data_for: a function that returns the mesh on the device of points p.

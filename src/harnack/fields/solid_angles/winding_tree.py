@@ -117,8 +117,8 @@ def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> It
     """
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
-        # sign: -1 for the edge that a triangle runs from j to i. Empty slots have the number -1; for
-        # them 0 marks an edge of length 0.
+        # sign: -1 for the edge that a triangle runs from j to i. Empty slots have the number -1;
+        # for them 0 marks an edge of length 0.
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
         edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY_COLUMN], inverse, frame, x)
         yield NearEdge(edge, row[SINGULAR + k] > 0)
