@@ -139,6 +139,7 @@ def map_batches(
                 )
             )
             dr.eval(*results)
+        # A result that is the same on all lanes may have only one row.
         parts.append(tuple(_repeat_single_row(to_numpy(array), max(lanes, 1)) for array in results))
     if len(parts) == 1:
         return tuple(array[:n] for array in parts[0])
@@ -202,5 +203,6 @@ def morton_order(backend: Backend, x: Vec3, bits: int = _BITS_PER_AXIS) -> Any:
         for bit in range(bits):
             # Bit b of axis k becomes bit 3 b + k of the key.
             key |= (cell & (1 << bit)) << (2 * bit + axis)
+    # NumPy sorts keys of 16 bits faster.
     keys = to_numpy(key).astype(np.uint16 if 3 * bits <= 16 else np.uint32)
     return upload_integers(backend, np.argsort(keys, kind="stable"))

@@ -247,7 +247,7 @@ class ModuloOne(abc.ABC):
             lies.
         """
         del rounding, active
-        return 0 * p.x + math.nan
+        return 0 * p.x + math.nan  # on each lane
 
 
 class Patches(abc.ABC):

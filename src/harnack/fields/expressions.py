@@ -126,8 +126,8 @@ class TextFormula:
         bare = re.search(rf"\b({'|'.join(_FUNCTIONS)})\s+[A-Za-z0-9]", side)
         if bare:
             raise _formula_error(text, f"the argument of {bare[1]} stands in brackets")
-        # A number or a closing bracket before a name or an opening bracket; or two names with a
-        # space between them.
+        # A number (but not the 2 of atan2) or a closing bracket before a name or an opening
+        # bracket; or two names with a space between them.
         missing = re.search(r"(?:[0-9](?<!atan2)|\))\s*[A-Za-z(]|[xyz)]\s+[A-Za-z0-9(]", side)
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
         raise _formula_error(text, hint)

@@ -318,8 +318,9 @@ class Field(Parametrized, abc.ABC):
 
     def refuse_hidden_parameters(self) -> None:
         """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
-        example in its formula, although its class does not have `has_parameter_derivatives`, or
-        none of them is one of its `parameters`. These derivatives would be lost."""
+        example in its formula, and these derivatives would be lost. They would be lost if the class
+        does not have `has_parameter_derivatives`; or, for a user's class, if none of the field's
+        `parameters` has derivatives enabled."""
         kind = type(self)
         # The `evaluate` of a user's class may refer to such numbers, too.
         is_own = not kind.__module__.startswith("harnack.")

@@ -130,6 +130,7 @@ class Formula(Field):
         distances, as for the library's shapes. Then small numbers in the formula are mere lengths,
         and 1 is taken in place of the smallest number, so that only large numbers make f abrupt.
         """
+        # self.lipschitz: the stated Lipschitz constant of f, or None.
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -162,6 +163,7 @@ class Formula(Field):
         middle = dr.select(is_bounded, sample.gradient, 0)
         error = dr.select(is_bounded, sample.gradient_error, dr.inf)
         norm = safe_norm(middle)
+        # The vector that is added makes sure that the direction runs along no tie.
         direction = dr.select(norm > 0, middle / norm, 0) + type(p)(*_TIE_DIRECTION)
         size = max_norm(p) + dr.abs(sample.value)
         # At the origin with f = 0 any offset will do.
@@ -404,7 +406,7 @@ def warn_if_slow_to_compile(field: Formula) -> None:
             f"{seconds:.0f} s to compile on an idle core, once for each precision: a Field of your "
             "own with a Lipschitz constant compiles in less than a second "
             "(docs/implicit.md, Long formulas)",
-            stacklevel=4,
+            stacklevel=4,  # the warning names the line that makes the field
         )
 
 
@@ -502,6 +504,7 @@ class FormulaOnRay:
 
     def _jet(self, start: Real, end: Real) -> Jet:
         """The jet of F (ranges of its value and derivatives) for start <= s <= end."""
+        # before: the length by which the first piece begins before p; the Python number 0 for none.
         is_exact = isinstance(self.before, float) and self.before == 0.0
         if not is_exact and isinstance(start, float):  # the first piece starts at 0.0
             start = -self.before

@@ -234,9 +234,9 @@ def _stored(made: object, name: str) -> Any:
 
 
 def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """The parameters in an argument, with their full names.
+    """Yield the parameters in an argument, as pairs of the full name and the value.
 
-    name, value: of the argument, or of a part of it.
+    name, value: the full name and the value of the argument, or of a part of it.
     """
     if isinstance(value, Parametrized):
         for inner, parameter in value.parameters().items():
@@ -273,8 +273,14 @@ def _key_name(key: Any) -> str:
 
 
 def _by_part(parts: Iterable[str], changes: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """For the name of each part in which something changes: the changes, by their names inside of
-    it; "" for the part itself."""
+    """Sort changes by the part in which they are.
+
+    parts: the names of the parts of an argument, or of arguments.
+    changes: new values by names that begin with the name of a part, such as "1.radius" for "1".
+
+    Returns for each part in which something changes: the changes, by their names inside of it, such
+    as "radius"; "" for the part itself.
+    """
     longest_first = sorted(parts, key=len, reverse=True)  # "1.5" before "1"
     found: dict[str, dict[str, Any]] = {}
     for changed, value in changes.items():
@@ -309,7 +315,8 @@ def _exchanged(value: Any, changes: dict[str, Any]) -> Any:
 
 
 def _in_form_of(old: Any, new: Any) -> Any:
-    """The new value: if it is an array in place of a list or tuple of numbers, it is made one."""
+    """The value `new`. If it is an array that replaces a list or tuple of numbers, `old`, it is
+    made a list or tuple, too."""
     if not isinstance(new, np.ndarray) or not _is_nested_numbers(old):
         return cast("Any", new)
 

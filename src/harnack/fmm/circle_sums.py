@@ -120,6 +120,7 @@ class UnitCircle:
         square = dr.fma(gap, gap, z * z)
         nearest, farthest = dr.sqrt(square), dr.sqrt(dr.fma(1 + r, 1 + r, z * z))
         inverse = 1 / farthest
+        # q: the attribute `share`, for which q r = 1 - kc.
         kc = nearest * inverse
         q = 4 * inverse / (farthest + nearest)
         gamma = gap / (1 + r)
@@ -146,6 +147,7 @@ class UnitCircle:
         w = dr.select(r < 1, real(2 * math.pi), 0) - 4 * height * inverse / (1 + r) * cel
         w = dr.select(r == 1, math.pi - 2 * height * inverse * first, w)
         bracket = 0.25 * dr.fma(kc, 4 + kc, 1) - dr.fma(kc, kc, 1) * total
+        # radial: J/q^2. third: I3.
         radial = first * inverse * bracket / (kc * kc)
         third = 4 * second * inverse / square
         # I3 - r^2 J in two forms; the first is for points near the circle.
@@ -170,11 +172,11 @@ class UnitCircle:
         """
         r, z = self.r, self.z
         a_sum = dr.fma(r, r, dr.fma(z, z, 1))  # A
-        j = self.share * self.share * self.radial
-        distance_product = self.nearest * self.farthest
+        j = self.share * self.share * self.radial  # J: `radial` is J/share^2
+        distance_product = self.nearest * self.farthest  # Rm Rp
         c5 = 2 * self.third + a_sum * j / 3  # (Rm Rp)^2 C5/r
         z_ratio, r_ratio = z / distance_product, r / distance_product
-        # fifth_difference = I5 - r C5, with I5 = (I3 + 2 r C5)/A.
+        # fifth_difference = I5 - r C5. As I5 = (I3 + 2 r C5)/A, it is (I3 + (2 - A) r C5)/A.
         fifth_difference = dr.fma(r_ratio * r_ratio * c5, 2 - a_sum, self.third) / a_sum
         return -3 * z * fifth_difference, dr.fma(-3 * z_ratio * z_ratio, c5, j), z * j
 
@@ -284,6 +286,8 @@ class CircleSet:
             lower_end = dr.select(
                 circle.r < 1, dr.select(is_above, real(-4 * math.pi), 0), -2 * math.pi
             )
+            # The integral of |dp|/D^2 is 2 pi/(nearest farthest a). That of |dp|/D^4 is at most the
+            # integral of |dp|/D^3 over the least distance, nearest a.
             return (
                 angle + circle.angle,
                 gradient,
@@ -319,12 +323,15 @@ class CircleSet:
             inverse_square = dr.rcp(a * a)
             outward_length = dr.norm(outward)
             radial = dr.select(outward_length > 0, outward / outward_length, 0)
-            # With u = radial:
+            # The Hessian of the circle's angle, with u = radial and f_rr = -f_zz - f_tt:
             # f_tt (I - n n - u u) + f_rr u u + f_zz n n + f_rz (n u + u n).
+            # It is divided by a^2, as f is a function of x/a; and f_rz u is f_rz_over_r outward/a.
+            # `add_outer_product` adds (p q^T + q p^T)/2, hence the factor 2.
             total = SymmetricMatrix(*state)
             total = total.add_outer_product(n, ((f_zz - f_tt) * inverse_square) * n)
             total = total.add_outer_product(radial, ((-f_zz - 2 * f_tt) * inverse_square) * radial)
             total = total.add_outer_product(n, (2 * f_rz_over_r * inverse_square / a) * outward)
+            # The first three entries are those on the diagonal.
             return (
                 *(entry + f_tt * inverse_square for entry in total.components()[:3]),
                 *total.components()[3:],
@@ -377,8 +384,9 @@ class CircleSet:
         real, vector = self._types
 
         def add(row: list[Real], rates: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the circle in the record `row` to the bounds `rates`, one for each length.
-            Returns the new bounds."""
+            """Add the circle in the record `row` to `rates`: for each of `lengths`, a bound of the
+            derivative of the solid angle along the line within this length of the point `line.x`.
+            The line has the unit direction `line.v`. Returns the new bounds."""
             relative = self._relative(row, line.x)
             # slack: the rounding of distances. axial: |w| of the proof.
             slack, axial = line.slack, fmin(dr.abs(dr.dot(relative.normal, line.v)), 1)

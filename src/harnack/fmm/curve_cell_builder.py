@@ -157,6 +157,7 @@ class _CurveCellBuilder:
         # octant's center is half of the half side from the cell's center along each axis, and the
         # ball's radius is sqrt(3) BALL_MARGIN half sides: hence the offset in units of the radius.
         shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
+        # The first depth has one cell, the cube.
         centers, runs, far = (
             self.middle[None],
             EdgeRuns.of_loops(self.vertices),
@@ -173,7 +174,8 @@ class _CurveCellBuilder:
             # The index of the first cell of this depth that is not split, and of the first that is.
             self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
             split_count += len(split)
-            # self.size: the number of bytes so far.
+            # self.size: the number of bytes so far. self.leaves: the number of cells so far that
+            # are not split.
             if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
                 return False
             if not len(split):
@@ -314,6 +316,9 @@ class _FarBounds:
 
         def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Add the edge from p to q to the sums of the cells with the centers c.
+
+            An edge is far if its distance from c is more than `far_from`. `ball_radius` is the
+            radius of the cells' balls.
 
             inverse: 1/|q - p|^2.
             state: the smallest squared distance of a far edge; then, summed over the far edges,
@@ -488,6 +493,7 @@ def _cell_records(
     coefficients, margin = far.coefficients.copy(), 1 + _SUM_MARGIN
     # The constant is known modulo 4 pi: the smallest such number is used.
     coefficients[:, 0] -= _PERIOD * np.round(coefficients[:, 0] / _PERIOD)
+    # rounding: (n, 4) for the value, and for the three derivatives in units of 1/radius.
     rounding = backend.machine_epsilon * np.abs(coefficients[:, 1:]) @ tables[1:]
     # 48 is 16 of `LoopEdges.rounding` and 32 of the third part.
     value_rounding = rounding[:, 0] + backend.machine_epsilon * (

@@ -231,7 +231,9 @@ class CurveCells:
 
         def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
             """Multiply two products of edge factors, one at x and one at the cell's center, by the
-            factors of the edges in record i of the cell.
+            factors of the near edges in record i of the cell, as seen along the rays `frame` from
+            the center to x. `count` is the number of these records, and `unit` bounds the rounding
+            of a coordinate. `cell_sums` tells which cell it is.
 
             p: the vertex before the record.
             is_certain: the mask of the lanes on which no rounding has mattered so far.
@@ -298,8 +300,10 @@ class CurveCells:
             return i < count
 
         def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
-            """Add the edges in record i of the cell. An edge of the curve adds to `rates`, the
-            bounds for all lengths. A closing edge adds its Biot and Savart field to `field`.
+            """Add the near edges in record i of the cell that `cell_sums` tells; `count` is the
+            number of these records. An edge of the curve adds to `rates`, the bounds along `line`
+            for all `lengths` (`add_edge_rates`). A closing edge adds its Biot and Savart field to
+            `field`.
 
             p: the vertex before the record.
 

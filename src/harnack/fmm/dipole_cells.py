@@ -190,10 +190,11 @@ class DipoleCells:
             return i < count
 
         def step(i: Any, sums: Any, extra_state: Any) -> tuple[Any, ...]:
-            """Add near primitive number i of the cell to the sums, given as a tuple of arrays, and
-            update `extra_state`, the state of the caller. Returns i + 1, the new sums and the new
-            state of the caller."""
-            # Other lanes in the loop have longer lists.
+            """Add near primitive number i of the cell to the sums, given as a tuple of arrays, by
+            the caller's function `add`, which also updates `extra_state`, the state of the caller.
+            Returns i + 1, the new sums and the new state of the caller."""
+            # The list of each lane's cell: `count` entries of `self.near`, from `first` on. Other
+            # lanes in the loop have longer lists.
             in_list = i < count
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
@@ -397,7 +398,9 @@ class _ParentExpansions:
     def of(self, cells: IntArray) -> DipoleExpansions:
         """Compute the expansions that the cells with these indices inherit, about their own
         centers."""
-        if not self.radius:  # the root inherits nothing: `sums` is zero
+        # self.sums: the expansions of the parents. self.radius: the radius of their balls; 0 for
+        # the root, which inherits nothing: `sums` is zero.
+        if not self.radius:
             return self.sums
         parents, parent_index = np.unique(cells // 8, return_inverse=True)
         octants = self.sums.subset(parents).to_octants(self.shifts, self.radius)
@@ -428,6 +431,7 @@ def _cell_records(
     margin, inverse = 1 + SUM_MARGIN, np.full(len(first), 1 / radius)
     # A cell without far primitives has an infinite distance, which must not enter products.
     least = np.minimum(sums.min_distance, 1e3) / margin
+    # Column 0 of `rounding` is for the value. s4: the bound of the sum of area/D^4.
     bounds = (sums.error, slope, sums.tail, sums.tail_slope, rounding[:, 0], sums.s4)
     # The index in two parts, since single precision does not hold large integers exactly.
     near_range = first % _INDEX_BASE, first // _INDEX_BASE, lengths
@@ -521,4 +525,5 @@ def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
     nodes = sum(len(level.is_leaf) for level in levels)
     # A record takes a multiple of eight numbers.
     record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
+    # The index of a near primitive takes four bytes.
     return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)

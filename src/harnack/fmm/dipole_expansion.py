@@ -123,9 +123,10 @@ def triangle_sources(corners: FloatArray) -> FloatArray:
     """
     # A tree in which each leaf is one triangle, to compute its moments.
     leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())
-    level = triangle_tree_moments(leaves, corners)[0]
+    level = triangle_tree_moments(leaves, corners)[0]  # the leaves; it has no other level
     moments, reach = level.moments, TRIANGLE_RATIO * level.radius
     error, slope, _ = truncation_bounds(level, reach, _MULTIPOLE_DEGREE - 1)
+    # Area times normal, from the moments M_11 and M_10 (`multipole.dipole_moments`).
     normal = 2 * moments[1, 1].real, 2 * moments[1, 1].imag, moments[1, 0].real
     higher = _columns(level, _TRIANGLE_MOMENTS)
     norms = [sup_norm(moments, l) for l in (1, 3, 4)]
@@ -221,8 +222,9 @@ class DipoleExpansions:
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """Compute what node i adds to the attributes of `DipoleExpansions`, in their order, as
-            a flat list of numbers. active: the mask of the lanes that have this node."""
+            """Compute what node i of the tree adds to the attributes of `DipoleExpansions`, for
+            balls with the centers c, in the order of the attributes, as a flat list of numbers.
+            active: the mask of the lanes that have this node."""
             # The record of the node, in the order of `source_tree`.
             head, payload = tree.node_heads.read_record(i, active), tree.payload(i, active)
             moments = dict(zip(_MOMENTS, payload, strict=False))
@@ -247,9 +249,9 @@ class DipoleExpansions:
         """
 
         def term(i: Any, active: Mask) -> list[Any]:
-            """Compute what primitive i, a dipole or a triangle, adds to the attributes of
-            `DipoleExpansions`, in their order, as a flat list of numbers. active: the mask of the
-            lanes that have this primitive."""
+            """Compute what primitive i of the tree, a dipole or a triangle, adds to the attributes
+            of `DipoleExpansions`, for balls with the centers c, in the order of the attributes, as
+            a flat list of numbers. active: the mask of the lanes that have this primitive."""
             # row: position, area times normal, area; of a triangle all of `triangle_sources`.
             row = tree.primitives.read_record(i, active)
             # The moments of degree 1, from area times normal.
@@ -412,8 +414,9 @@ class _ClusterExpansion:
         area: the sum of the areas of its dipoles.
         radius: the radius of the ball.
         """
-        # The points of the ball are farther from the source's center than the gap distance -
-        # radius.
+        # self.inverse: one over the distance of the source's center from the ball's center.
+        # All points of the ball are at least this gap away from the source's center: the distance
+        # of the ball's center, minus the ball's radius.
         distance = dr.rcp(self.inverse)
         inverse_gap = dr.rcp(distance - radius)
         # power: 1/gap^(k+1) for the first degree k that is left out, one more than
@@ -474,8 +477,7 @@ class PendingSources:
         tree: the tree of the primitives.
         c: (3, n) the centers of the balls.
         radius: the radius of the balls.
-        factor: the number k of the module docstring: a dipole is far if it is farther than `factor`
-            radii from the center of the ball.
+        factor: a dipole is far if it is farther than `factor` radii from the center of the ball.
         max_node_radius: an inner node that is not far remains a node if its radius is at most this.
             A larger one is replaced by its children, and a leaf by its primitives, each of which
             is far or near by itself.
@@ -554,8 +556,10 @@ class PendingSources:
             return (is_far if far else ~is_far) & (row[6] > 0) & active
 
         def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-            """Visit a node of the tree. In a leaf that is not far, count and store the primitives
-            that are sought.
+            """Visit a node of the tree, for a ball with the center c on each lane. In a leaf that
+            is not far, count and store the primitives that are sought: the far ones, or with
+            far=False the near ones. A dipole is far if it is farther than `far_radius` from c. Only
+            inner nodes with a radius of more than `max_node_radius` are entered.
 
             node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
             state: a tuple with the number of primitives so far.
@@ -564,12 +568,13 @@ class PendingSources:
             """
             square = dr.squared_norm(c - vector(*node.head[:3]))
             enters = square <= dr.square(far_radius + node.head[3])
-            # Only nodes whose ball comes near have near dipoles; the radius (head[4]) is increased
+            # If the primitives are dipoles (`are_points`), only nodes whose ball comes near have
+            # near ones; the radius (head[4]) is increased
             # a little against rounding.
             if are_points and not far:
                 enters &= square <= dr.square(far_radius + node.head[4] * (1 + 1e-9) + 1e-12)
             enters &= node.is_leaf | (node.head[4] > max_node_radius)
-            # Lanes that have counted enough stop.
+            # Lanes that have counted enough stop; `count_limit` is None for no such limit.
             if count_limit is not None:
                 enters &= state[0] <= count_limit
 
@@ -582,16 +587,19 @@ class PendingSources:
                 """Count and store the primitive in a slot of the leaf if it is sought. count: the
                 number so far. Returns the next slot and the new number."""
                 chosen = is_chosen(tree.primitive(node.leaf, slot, enters), enters)
+                # `store` is None in the pass that only counts.
                 if store is not None:
                     store(count, node.leaf * tree.leaf_size + slot, chosen)
                 return slot + 1, count + dr.select(chosen, uint_t(1), uint_t(0))
 
+            # The loop's state is the slot and the number of primitives.
             return enters, (
                 dr.while_loop((uint_t(0), state[0]), runs, step, label="primitives")[1],
             )
 
         def listed(i: Any, active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Count and store primitive i of the ball's list if it is sought.
+            """Count primitive i of the ball's list if it is sought (`is_chosen`), and store its
+            index unless the function `store` is None.
 
             active: the mask of the lanes that have an entry.
             state: a tuple with the number of primitives so far. Returns the new number, in a tuple.
@@ -637,7 +645,9 @@ def _count_nodes(
     uint_t, vector = tree.backend.UInt32, tree.backend.Array3f
 
     def visit(node: VisitedNode, state: tuple[Any, ...]) -> tuple[Mask, tuple[Any, ...]]:
-        """Count a node, and store its index, if it is of the kind that is sought.
+        """Count a node if it is of the kind that is sought: far from the center c of the ball, or
+        with far=False pending: not far, no leaf, and of a radius of at most `max_node_radius`.
+        Store its index unless the function `store` is None.
 
         node: its `head` holds center, `_NODE_RATIO` times the radius, and radius.
         state: a tuple with the number of nodes so far.
@@ -652,4 +662,5 @@ def _count_nodes(
             store(state[0], node.index, chosen)
         return ~(is_far | is_pending), (state[0] + dr.select(chosen, uint_t(1), uint_t(0)),)
 
+    # The state has one entry, the number of nodes.
     return traverse_subtrees(tree, lists, visit, (uint_t(0),))[0]

@@ -171,8 +171,10 @@ def _over_pieces(
         return j < count
 
     def body(j: Any, t: Real, zr: Real, zi: Real, *sums: Real) -> tuple[Any, ...]:
-        """Add the piece of edge j that begins at the parameter t in [0, 1). With its first piece,
-        multiply the product (zr, zi) by the edge's factor.
+        """Add the piece of the ball's far edge j that begins at the parameter t in [0, 1). With its
+        first piece, multiply the product (zr, zi) by the edge's factor. The ball has the center c.
+        Its edges are number `first` to `first` + `count` - 1 in the lists `start` and `end`, which
+        hold the rows of their ends in `points`.
 
         sums: bounds of the errors, and the coefficients after the first.
 
@@ -257,6 +259,8 @@ class _EdgePiece:
         2^14 |e|/D (tests compute it), with D the distance of a node of Gauss's rule from the
         center. So the value, and the gradient times the radius, are off by at most 2^-29 |e|/D.
         """
+        # self.e: the vector from the start to the end of the piece. self.middle: its middle,
+        # relative to the center of the ball.
         half = 0.5 * dr.norm(self.e)
         area = dr.norm(dr.cross(self.middle, self.e))
         error, slope = _quadrature_errors(dr.norm(self.middle) - radius, half, area, radius)
@@ -270,7 +274,8 @@ class _EdgePiece:
             value_tail, slope_tail = tail_bounds(radius * inverse)
             strength = weight * area * dr.square(inverse)
             rounding = _TERM_ROUNDING * weight * 2 * half * inverse
-            # total: the coefficients of phi, from the irregular harmonics at the node.
+            # total: the coefficients of phi, the mean of 1/distance over the piece (see the
+            # module), from the irregular harmonics at the node.
             error = error + rounding + strength * value_tail
             slope = slope + (rounding + strength * slope_tail) / radius
             for key, pair in irregular_harmonics(d.x, d.y, d.z, inverse, DEGREE).items():
@@ -285,8 +290,9 @@ def tail_bounds(q: Any) -> tuple[Any, Any]:
 
     q: rho/|d|.
 
-    Returns two numbers. Let S be the sum of all terms of degree above p = DEGREE of the edge's
-    function g (see the module). Anywhere in the ball |S| is at most the first number times |d x
+    Returns two numbers. The solid angle at c + u minus that at the center c is the sum of a
+    function g(u) of each edge. Let S be the sum of all terms of degree above p = DEGREE of the
+    edge's g. Anywhere in the ball |S| is at most the first number times |d x
     dp|/|d|^2, and rho |grad S| is at most the second number times |d x dp|/|d|^2.
 
     Proof. For a point u of the ball, phi = sum over j of |u|^j P_j(s)/|d|^(j+1), with s the cosine
@@ -357,7 +363,8 @@ def _quadrature_errors(distance: Real, half: Real, area: Real, radius: Real) -> 
 
 
 def _rotated_coefficients(phi: dict[Any, list[Any]], e: Vec3, radius: Real) -> list[Real]:
-    """Compute the coefficients of g from those of phi: g is the integral over s in [0, 1] of
+    """Compute the coefficients of a piece's solid angle g from those of its potential phi, the mean
+    of 1/distance over its points. g(u) is the integral over s in [0, 1] of
     e . (u x grad) phi(su)/s.
 
     phi: the coefficients L_jk of phi, as pairs of real and imaginary part by (j, k).

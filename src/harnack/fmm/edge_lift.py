@@ -80,7 +80,8 @@ class LiftedEdges:
             w times.
         """
         table = edge_records(vertices, edges)
-        # An edge from a vertex to itself, with direction 0, adds nothing.
+        # Loops over the records take `_EDGES_PER_TRIP` in each trip. The last trip is filled up
+        # with an edge from a vertex to itself, with direction 0, which adds nothing.
         padding = np.concatenate([table[0, :3], [0.0], table[0, :3], table[0, 7:]])
         return cls(RecordTable.upload(backend, table, padding, _EDGES_PER_TRIP))
 
@@ -142,7 +143,8 @@ class LiftedEdge:
     def factor(self) -> tuple[Real, Real]:
         """Compute the real and the imaginary part of the edge's factor F_e, a complex number whose
         argument is half the solid angle of the edge's triangle."""
-        # a, b: the ends relative to x, as two coordinates across the ray and one along it.
+        # a, b: the ends relative to x, as two coordinates across the ray and one along it, in the
+        # frame of the ray.
         vector, frame, edge = cast("Any", type(self.edge.a)), self.frame, self.edge
         pairs = zip(self.ends, (edge.a, edge.b), strict=True)
         a, b = (vector(*frame.transverse(p), frame.component(a)) for p, a in pairs)
@@ -264,6 +266,7 @@ class LiftedSums:
         rounding, s4, s5 = edge.bounds(unit)
         # On other lanes the product is multiplied by 1; scaling it again may round it.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
+        # edge.edge: the positions of the ends relative to the point.
         distance = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
             sums,
@@ -320,7 +323,8 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge in the record `row` to the sums, given as a state (`SourceSums.to_state`). A
-        record that is padding has the direction 0 and adds nothing. Returns the new state."""
+        record that is padding has the direction 0 and adds nothing. Returns the new state. `unit`
+        bounds the rounding of a coordinate."""
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         # On other lanes the terms are 0.
@@ -329,6 +333,7 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
         s4, s5 = (dr.select(active, bound, 0) for bound in (s4, s5))
         return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).to_state()
 
+    # dr.inf: the distance of the nearest edge before any is added.
     start = SourceSums.zero(backend, dr.inf, derivatives).to_state()
     return SourceSums.from_state(edges.records.for_each(add, start, "rates of edges"))
 

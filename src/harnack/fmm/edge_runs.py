@@ -103,7 +103,8 @@ class EdgeRuns:
 
         is_split: (n,) the mask of the cells that are split.
         """
-        # Each chosen run becomes eight, sorted by their new cells.
+        # Each chosen run becomes eight, sorted by their new cells. split_index: the number of each
+        # cell among those that are split. repeated: positions among the chosen runs.
         is_chosen = is_split[self.cell]
         split_index = np.cumsum(is_split) - 1
         parent, count = split_index[self.cell[is_chosen]], int(is_chosen.sum())
@@ -216,6 +217,7 @@ class EdgeRuns:
         apex = center + _APEX_RATIO * radius[self.cell, None] * np.where(
             is_short, perpendicular, _unit(direction_sum)
         )
+        # Rounded as the backend will round it.
         apex = apex.astype(number).astype(np.float64)
         return EdgeRuns(self.cell, self.first, self.count, self.is_whole, apex)
 

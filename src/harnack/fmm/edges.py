@@ -161,11 +161,10 @@ class LoopEdges:
         """Loop over all edges, one after another, and for each edge from p to q set state = body(p,
         q, 1/|q - p|^2, state). Returns the last state.
 
+        body: the function that returns the new state.
         state: the first state.
         label: the name of the recorded loop.
         active: the mask of the lanes on which the loop runs.
-
-        body: the function that returns the new state.
         """
 
         def of_record(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -226,9 +225,9 @@ def _loop_records(loop: FloatArray, run: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Edge:
-    """The straight edge of a closed curve from p to q, relative to a point x. The edge adds its
-    Biot and Savart field w c, a vector with a factor w and c = a x e, to the gradient of the
-    curve's solid angle at x (paper, Eq. 11).
+    """The straight edge of a closed curve from p to q, relative to a point x: a = p - x, b = q - x,
+    and e = q - p. The edge adds its Biot and Savart field w c, with a factor w and the vector
+    c = a x e, to the gradient of the curve's solid angle at x (paper, Eq. 11).
 
     a, b: p - x and q - x.
     e: q - p, which is free of the rounding of x.
@@ -427,6 +426,7 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
         Then come a quarter of the bound of the integral of |dp|/D^2, and half of the other two
         integrals."""
         zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = state
+        # la: |a|; sa and ca: the number s and the spinor of a. Likewise for b.
         p = edges.vertex(row, 0)
         a = p - x
         la, sa, ca = spinor(a)

@@ -199,13 +199,14 @@ def dipole_tree_moments(
 
     Returns one entry for each level of the tree, from the leaves to the root.
     """
-    # each: the number s of dipoles of a primitive.
+    # each: the number s of dipoles of a primitive. p, n: the positions and the normals.
     backend, each = choose_backend("double"), points.shape[1]
     p, n, lows, highs = (upload_floats(backend, x.ravel()) for x in (points, normals, low, high))
 
     def primitive(i: Any) -> _DipolePrimitive:
-        """Read the dipoles and the box of primitive i from the buffers. i may differ from lane to
-        lane."""
+        """Read the dipoles, `each` of them, and the box of primitive i from the buffers of
+        positions p, normals n, and corners `lows` and `highs`. i may differ from lane to lane."""
+        # 1: the whole area of a dipole is at its single point.
         dipoles = [
             _Dipole(_row(backend, n, i * each + k), ((1.0, _row(backend, p, i * each + k)),))
             for k in range(each)
@@ -311,7 +312,8 @@ def _leaf_moments(
 
     def visit(body: Callable[..., tuple[Any, ...]], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Loop over the primitives of each leaf, one after another, and for each of them set state
-        = body(primitive, *state). Returns the last state."""
+        = body(primitive, *state). The leaf's primitives are the entries `first` to `end` - 1 of
+        `slots`. Returns the last state."""
 
         def step(slot: Any, *state: Any) -> tuple[Any, ...]:
             """Update the state by the primitive in a slot. Returns the next slot, and then the new
@@ -500,7 +502,8 @@ def cartesian_coefficients(moments: Moments, order: int = 2) -> FloatArray:
     """
     real = {key: value.real for key, value in moments.items()}
     imag = {key: value.imag for key, value in moments.items()}
-    # r and i: real and imaginary part of M_lm, times the factor of its Cartesian form.
+    # r and i: real and imaginary part of M_lm, times the factor of its Cartesian form. They follow
+    # from writing conj(M_lm) I_lm, summed over m and -m, in x, y, z.
     dipole = [2 * real[1, 1], 2 * imag[1, 1], real[1, 0]]
     r20, r21, i21 = real[2, 0], 6 * real[2, 1], 6 * imag[2, 1]
     r22, i22 = 6 * real[2, 2], 6 * imag[2, 2]
@@ -555,6 +558,7 @@ def sup_norm(moments: Moments, l: int) -> FloatArray:
     """
     total = 0.0
     for m in range(l + 1):
+        # The terms m and -m are equal.
         weight = math.factorial(l + m) * math.factorial(l - m) * (1 if m == 0 else 2)
         total = total + weight * np.abs(moments[l, m]) ** 2
     return np.sqrt(np.asarray(total))

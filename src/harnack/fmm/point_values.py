@@ -107,7 +107,8 @@ class PointValues:
         # Nearer than 4 the second error does not matter, so |x| counts as at least 4.
         inverse = dr.rcp(fmax(dr.norm(x), type(x.x)(4)))
         moment_error = _MOMENT_ROUNDING * weight * dr.square(inverse)
-        # Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and 24 are larger, to spare.
+        # `inverse` is 1/r with r = |x|. Derivatives of 1/r^2 are 2/r^3 and 6/r^4; the factors 4 and
+        # 24 are larger, to spare.
         return dataclasses.replace(
             self,
             error=self.error + underflow + moment_error,
@@ -168,6 +169,7 @@ def sharpened(at: Callable[[Vec3, Real], PointValues], x: Vec3) -> PointValues:
     # The indices of the points whose gradient is to be refined.
     # (Written with ~, so that NaN counts as not accurate.)
     rows = dr.compress(~(error <= _ACCEPTED_ERROR * dr.norm(gradient)))
+    # closer: a larger and larger accuracy scale.
     for closer in _DISTANCE_MULTIPLES:
         if not len(rows):
             break

@@ -183,13 +183,17 @@ class RadialSums:
         """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r.
 
         share: r must be at most `share` times the distance to the nearest dipole.
-        growth: the result of `RadialKernel.growth` for r.
+        growth: a factor >= 1 by which Q_3 may grow where distances from dipoles shrink by up to r
+            (`RadialKernel.growth`).
 
-        Proof. At distance s from x, each term's second derivatives are at most |K^(3)| = 6
-        Q_3/(d_i-s)^4. By Taylor the integral of (t-s) times that, with t = |y-x|, bounds the term's
-        remainder. With q = t/d_i it is at most growth Q_3 (3-2q)/(1-q)^2 t^2/d_i^4. (3-2q)/(1-q)^2
-        is convex in q, and so at most its chord on [0, share].
+        Proof. At distance s from x, each term's second derivatives are at most w_i times
+        |K^(3)| = 6 Q_3/(d_i-s)^4, where Q_3 is at most growth times its value at x. By Taylor the
+        integral of (t-s) times that, with t = |y-x|, bounds the term's remainder. With q = t/d_i it
+        is at most growth w_i Q_3 (3-2q)/(1-q)^2 t^2/d_i^4. (3-2q)/(1-q)^2 is convex in q, and so at
+        most its chord on [0, share].
         """
+        # With the chord's values, the sum over i follows from s4 and s5, the sums of
+        # w_i Q_3/d_i^4 and of w_i Q_3/d_i^5.
         return (1 + SUM_MARGIN) * growth * self.sums.remainder(share, r)
 
     def curvatures(
@@ -214,13 +218,15 @@ class RadialSums:
 
     def variation(self, r: Real, growth: Real) -> Real:
         """A bound of |f(y) - f(x)| on the ball B(x, r). r must be at most `BALL_FRACTION` times the
-        distance to the nearest dipole. growth: the result of `RadialKernel.growth` for r.
+        distance to the nearest dipole. growth: a factor >= 1 by which Q_2 may grow where distances
+        from dipoles shrink by up to r (`RadialKernel.growth`).
 
         It is the sum over the dipoles of w_i times the integral of |K^(2)| = 2 Q_2/(d_i-s)^3 over s
         from 0 to r. With q = r/d_i the integral is Q_2/d_i^2 times 1/(1-q)^2 - 1 = 2q + c q^2. The
         factor c grows with q, and so is at most its value at q = `BALL_FRACTION`.
         """
         c = (1 / (1 - BALL_FRACTION) ** 2 - 1 - 2 * BALL_FRACTION) / BALL_FRACTION**2
+        # q2_d3, q2_d4: the sums of w_i Q_2/d_i^3 and of w_i Q_2/d_i^4.
         change = dr.fma(c * r, self.q2_d4, 2 * self.q2_d3)
         return (1 + SUM_MARGIN) * growth * r * change
 
@@ -271,6 +277,7 @@ def combine_terms(
     common factor `scale` and powers of 1/D, which `parts` and `radial` leave out, are multiplied at
     the end, so that no factor overflows.
     """
+    # theta[k], scale: psi_k without its powers of D, and the factor that all psi_k have in common.
     vector = _type_of(z)
     theta, scale, u2 = radial.thetas, radial.scale, inverse * inverse
     value, next_value, after_next_value = 0.0, 0.0, 0.0
@@ -348,6 +355,7 @@ def dipole_source(
     terms = combine_terms(
         [part], z, inverse, kernel.at(distance, inverse, 1 + derivatives), derivatives
     )
+    # `kernel.bounds` returns Q_2 and Q_3.
     return SourceAtPoint(
         terms, row[6], KernelBounds.of(distance, inverse, kernel.bounds(distance, 3))
     )

@@ -124,6 +124,7 @@ class RadialSum(abc.ABC):
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         dipole = dipole_source(row, x, self.kernel, derivatives)
+        # self.rounding: the rounding of a term, as a fraction; True: on all lanes.
         return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
 
 
@@ -206,7 +207,8 @@ def cluster_source(
     derivatives: int,
 ) -> SourceAtPoint:  # fmt: skip
     """What a cluster of dipoles adds at a point to the sum f: value and derivatives, with bounds of
-    their truncation errors. The formulas are those of the module.
+    their truncation errors. The cluster's potential is replaced by its Taylor polynomial of degree
+    2 in the dipoles' offsets from the center.
 
     head: the first six numbers of the cluster's record: center, accepting distance, radius, weight.
     c: the other numbers of its record: 23 coefficients, and the third moment (`node_records`).
@@ -306,9 +308,11 @@ def taylor_tree_moments(tree: BalancedTree, rows: FloatArray) -> list[TaylorMome
     """
     slots = records_in_slots(tree, rows)
     levels: list[TaylorMoments] = []
-    # Leaves have no children: the first arity, 0, is not used.
+    # count: the number of nodes at a level. Leaves have no children: the first arity, 0, is not
+    # used.
     for count, arity in zip(tree.counts, (0, *tree.arities), strict=True):
-        # (count, dipoles below a node, ...): positions, moments, weights.
+        # Positions, moments and weights, each (count, dipoles below a node, ...): the columns 0 to
+        # 2, 3 to 5, and 6 of the records.
         position, moment, weights = np.split(
             slots.reshape(count, -1, slots.shape[2])[..., :7], [3, 6], axis=2
         )

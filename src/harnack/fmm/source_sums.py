@@ -111,7 +111,9 @@ class SourceTerm:
 class SourceSums:
     """The sums over all sources (dipoles, edges and far nodes of a tree) at points x, one point in
     each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
-    follow.
+    follow. These numbers are the distance to the nearest singular point (a dipole or a point of an
+    edge), and s4 and s5: the sums of a/rho^4 and a/rho^5 over all sources, with the area a of a
+    source and its distance rho.
 
     total: the sum of the values as it was rounded. The property `value` adds `compensation` to it.
     gradient: (3,) of f; None if it was not requested.
@@ -400,6 +402,7 @@ class SourceSums:
         """
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
+        # R is this fraction of the distance to the nearest singular point, less rounding.
         fraction = _TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
         # Without sources s5 is 0 and R may be infinite; then R s5 would be NaN.
@@ -413,7 +416,8 @@ class SourceSums:
 
     def remainder(self, b: float, r: Real) -> Real:
         """The number K such that f differs from its linear part by at most K t^2 at any distance t
-        <= r from x: K = 3 s4 + rise r s5, with the symbols of `sample`.
+        <= r from x: K = 3 s4 + rise r s5. Here rise is the slope of the chord over [0, b] of
+        (3 - 2q)/(1 - q)^2 (`sample` has the proof).
 
         b: the largest ratio of t to the distance of a source from x.
         r: b times the distance to the nearest singular point, or less.

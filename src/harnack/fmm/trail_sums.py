@@ -306,8 +306,8 @@ class _AngleProduct:
         """
         x = dr.fma(self.x, factor[0], -(self.y * factor[1]))
         y = dr.fma(self.x, factor[1], self.y * factor[0])
-        # -1 if the sign of y changes, else 0. The number ANDed with it is -1 for a factor that
-        # turns back, else 1.
+        # `half` counts half planes. sign_change: -1 if the sign of y changes, else 0. The number
+        # ANDed with it is -1 for a factor that turns back, else 1.
         sign_change = bits.sign(self.y) ^ bits.sign(y)
         return _AngleProduct(x, y, self.half + (sign_change & (bits.sign(factor[1]) | 1)))
 
@@ -432,7 +432,8 @@ class TrailValues:
             """The new state: the products and margins of all points, which `state` holds, after
             multiplication by the factors of the edges in the record `row`."""
             # Column 15, behind five vertices, is the number of edges that are no padding. Padding
-            # leads from a vertex to itself: it is never uncertain.
+            # leads from a vertex to itself: it is never uncertain. slack: minus the relative error
+            # of a product.
             slacks = [dr.select(row[15] > k, slack, 1) for k in range(_EDGES_PER_RECORD)]
             pairs = zip(points, state, strict=True)
             return tuple(
@@ -625,7 +626,10 @@ class LiftedTrails:
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """The new state, after the edges in the record `row` have been added. It holds the
             product of factors, the gradient, the least squared distance, the bound of the rounding,
-            s4 and s5."""
+            s4 and s5 (quantities of `SourceSums` that bound the remainder of Taylor's formula)."""
+            # L is the length of an edge, d its distance from x, w c its Biot and Savart field.
+            # `factor_rounding` bounds the rounding of a record's factors, and `unit` that of a
+            # coordinate; `steep_rounding` is STEEP_ROUNDINGS unit roundoffs.
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)

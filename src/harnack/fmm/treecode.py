@@ -101,8 +101,11 @@ def traverse_clusters(
     vector = tree.backend.Array3f
 
     def visit(node: VisitedNode, state: State) -> tuple[Mask, State]:
-        """Add the node on lanes on which it is far; on other lanes, add its primitives if it is a
-        leaf. Returns the mask of the lanes on which the walk enters the node, and the new state."""
+        """Add the node, by the function `add_cluster`, on lanes on which it is far from x: farther
+        than `closer` times its accepting distance. On other lanes, if it is a leaf, add its
+        primitives by the function `add_primitive`. `height_square` is added to all squared
+        distances. Returns the mask of the lanes on which the walk enters the node, and the new
+        state."""
         # A record begins with the center and the accepting distance.
         r = x - vector(*node.head[:3])
         square = dr.squared_norm(r) + height_square
@@ -371,6 +374,7 @@ class Treecode:
             )
             nodes.append(node_records(level, order, coarse_ratio, error))
         packed = pack_tree(backend, tree, nodes, primitives)
+        # The factors 1 + 1e-6 are for the rounding to single precision.
         ratios = error_ratio, slope_ratio * (1 + 1e-6), second_ratio * (1 + 1e-6)
         uploaded = (dr.opaque(backend.Float, ratio) for ratio in ratios)
         return cls(backend, packed, accuracy, coarse_ratio, order, *uploaded)
@@ -410,7 +414,9 @@ class Treecode:
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
-            of the sums and the caller's own state. Returns the new state."""
+            of the sums and the caller's own state. `free_fraction` times the distance of the node's
+            center is the radius of a ball around x that is free of the node's sources. Returns the
+            new state."""
             # The coefficients c[:15] of the moments, and c[15] = E (`node_records`).
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
@@ -445,7 +451,9 @@ class Treecode:
             SourceSums.from_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
-        # The loop has added up error bounds without the ratios, which are the same for all nodes.
+        # The loop has added up error bounds without the ratios, which are the same for all nodes:
+        # self.gradient_error_ratio and self.hessian_error_ratio are those of the errors of the
+        # derivatives to the error of the value.
         second = sums.hessian_truncation
         sums = dataclasses.replace(
             sums,

@@ -96,7 +96,9 @@ class BalancedTree:
         visited together, lie side by side in memory. A leaf has no children: the index of its first
         child is given as 0, which is the index of the root.
         """
-        below = [0]  # the number of nodes below a node, for each level
+        # self.arities: the number of children of a node at each level, from the parents of the
+        # leaves to the root. below: the number of nodes below a node, for each level.
+        below = [0]
         for arity in self.arities:
             below.append(arity * (1 + below[-1]))
         # The root has the index 0, its first child 1. From there, level by level downwards.
@@ -191,7 +193,7 @@ def _split(point_ids: IntArray, positions: FloatArray) -> tuple[IntArray, FloatA
     key = positions[_box_sizes(positions).argmax(axis=0), np.arange(count)]
     order = cast("IntArray", np.argpartition(key, middle, axis=1))
     short_rows = np.flatnonzero(np.isnan(key[:, -1]))
-    # The empty slot is somewhere on the right: move it to the end of the row.
+    # The empty slot, number width - 1, is somewhere on the right: move it to the end of the row.
     empty_slot = (order[short_rows] == width - 1).argmax(axis=1)
     order[short_rows, empty_slot], order[short_rows, -1] = order[short_rows, -1], width - 1
     # A short row of odd width 2m + 1 has 2m points, and its left half has m + 1 slots. The last of
@@ -306,7 +308,7 @@ def pack_tree(
         # Minus the first child; for leaves it is replaced below.
         heads[index, _CALLER_NUMBERS + 1] = -first_child
         payloads[index] = values[:, _CALLER_NUMBERS:]
-    leaves = links[0][0]
+    leaves = links[0][0]  # the indices of the nodes at level 0
     heads[leaves, _CALLER_NUMBERS + 1] = np.arange(len(leaves))
     return PackedTree(
         backend,
@@ -361,8 +363,8 @@ def traverse(tree: PackedTree, visit: Visit, state: LoopValues, active: Mask = T
     index, mask = tree.backend.UInt32, tree.backend.Bool
 
     def body(i: Any, *state: Any) -> LoopValues:
-        """Visit node i. Returns the index of the node to visit next, which is its first child or
-        the node after its subtree, and then the new state."""
+        """Visit node i of the tree. Returns the index of the node to visit next, which is its first
+        child or the node after its subtree, and then the new state."""
         head = tree.head(i)
         # head[6]: the node after the subtree. head[7]: the number of the leaf, or minus the index
         # of the first child. The root is nobody's child, so that this is never -0.

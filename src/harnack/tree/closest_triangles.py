@@ -100,8 +100,9 @@ class BoxTree:
             return is_met, for_each_primitive(node, is_met & node.is_leaf, nearer, state)
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-            """The new state: the box in the record `row` if it comes after `after` and before the
-            best box so far, which is `state`; otherwise `state`."""
+            """The new state: the box in the record `row` if the ray enters it between `start` and
+            `end`, after the pair `after` = (`t_after`, `n_after`), and before the best box so far,
+            which is `state`; otherwise `state`."""
             best, leave, number = state
             near, far = enter_and_leave(row)
             # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -143,7 +144,8 @@ class BoxTree:
         pad = 16 * backend.machine_epsilon * (1 + max_norm(o))
 
         def interval(box: Any) -> tuple[Real, Real]:
-            """The t at which the rays enter the box, and the t at which they leave it. box: its six
+            """The t at which the rays enter the box, enlarged by `pad`, and the t at which they
+            leave it. `inverse` is one over the rays' direction, for each coordinate. box: its six
             numbers, lower corner first."""
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
             a, b = (low - o) * inverse, (high - o) * inverse
@@ -289,6 +291,7 @@ def squared_distance_in_nearby_leaf(tree: PackedTree, x: Vec3, column: int) -> R
         del square
         return slot < tree.leaf_size
 
+    # The state is the slot and the smallest squared distance.
     return dr.while_loop((index(0), real(dr.inf)), has_slots, add, label="points of a leaf")[1]
 
 
@@ -319,8 +322,9 @@ def next_closest_triangle(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """The new state: the triangle in the record `row` if it comes after `after` and before the
-        best triangle so far, which is `state`; otherwise `state`."""
+        """The new state: the triangle in the record `row` if it comes after the pair `after` =
+        (`square_after`, `number_after`) and before the best triangle so far, which is `state`;
+        otherwise `state`."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -361,7 +365,8 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
     vector = triangles.tree.backend.Array3f
 
     def may_be_within(node: VisitedNode, square: Real) -> Mask:
-        """Whether the node's enlarged box and slab come within the distance sqrt(square) of x."""
+        """Whether the node's box and slab, enlarged by `pad`, come within the distance
+        sqrt(square) of x."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
         # The vector from x to the box, up to signs.
         gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
@@ -445,6 +450,8 @@ class ClosestPointOnTriangle:
         alpha, away = _project_on_edge(-a, e, inverse)
         beta, h = _project_on_edge(of_longest(r, p, q) - a, e, inverse)
         s = dr.dot(away, h) / dr.squared_norm(h)  # NaN for a triangle without an area: not inside
+        # s: how high x is projected, as a fraction of the triangle's height. There, the triangle
+        # reaches along the edge from s beta to 1 - s (1 - beta).
         is_inside = (s >= 0) & (s <= 1) & (alpha >= s * beta) & (1 - alpha >= s * (1 - beta))
         # From x to the closest point of the plane.
         across = dr.fma(vector(s), h, -away)
@@ -509,7 +516,7 @@ def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Ma
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """The new state: the sum so far, `state`, plus |jump| of the triangle in the record `row`,
-        if this triangle is within the distance."""
+        if the square of its distance from x is at most `square`."""
         is_within = (
             active
             & (row[NUMBER_COLUMN] >= 0)

@@ -124,8 +124,8 @@ def _candidates(corners: FloatArray, normals: FloatArray, heights: FloatArray) -
     difference, or a coordinate of its normal is nearer to 0.3 in magnitude than this difference.
     """
     excess = np.abs(normals) - 0.3
-    # The first coordinate larger than 0.3 in magnitude decides the orientation.
-    # The place of the first True, by `argmax`.
+    # The first coordinate larger than 0.3 in magnitude decides the orientation: `argmax` gives the
+    # place of the first True.
     deciding = np.take_along_axis(normals, (excess > 0).argmax(axis=1)[:, None], axis=1)
     normals = np.where(deciding < 0, -normals, normals)
     plane = np.column_stack([normals, np.einsum("ni,ni->n", normals, corners[:, 0])]) / _PLANE_CELL
@@ -158,7 +158,8 @@ def overlapping_faces(
     backend = tree.tree.backend
     corners = vertices[faces]
     normals, heights = _normals(corners)
-    # In each round, find the next partner of each face of `searching`, after the last one found.
+    # In each round, find the next partner of each face of `searching`, after the last one found
+    # (`after`; -1 is before all faces).
     searching = _candidates(corners, normals, heights)
     sizes, after = backend.Float(heights), np.full(len(searching), -1.0)
     batches: list[IntArray] = []
@@ -207,7 +208,10 @@ def _next_in_plane(
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """The new state: the number of the face in the record `row` if this face is sought and its
-        number is lower than `state`, the lowest so far; otherwise `state`."""
+        number is lower than `state`, the lowest so far; otherwise `state`. A face is sought if its
+        number is above `after`, it is larger than the lane's face (with the corners `corners` and
+        the size `size`), lies in its plane and overlaps it."""
+        # The number -1 of an empty slot is no index; such a slot is never chosen.
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)

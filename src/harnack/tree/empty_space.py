@@ -372,6 +372,7 @@ class GridCell:
         The path may leave the cube through a face on which the grid ends, since points outside of
         the grid are treated like the nearest cell. So the length may be infinite.
         """
+        # self.corner: the lower corner of the point's cell.
         length: Real = self.grid.backend.Float(dr.inf)
         margin = self.grid.margin - _ROUNDING_SHARE
         for k in range(3):
@@ -436,7 +437,7 @@ class OccupancyGrid(GridData):
         """
         reach = np.abs([lower, upper]).max().astype(np.float32)
         cell = max(float((upper - lower).max()) / across, float(np.spacing(reach)))
-        cell = round_to_short_float(cell)
+        cell = round_to_short_float(cell)  # single precision has its small multiples exactly
         # For rounding the corner down, and for the margin beyond the box.
         room = (_MARGIN + 1e-3) * cell
         origin = np.nextafter((lower - room).astype(np.float32), np.float32(-np.inf))
@@ -476,7 +477,7 @@ class OccupancyGrid(GridData):
         """
         x, y, z = self.shape
         is_occupied = (self.empty_distance == 0).reshape(z, y, x)
-        indices = np.argwhere(is_occupied)[:, ::-1]
+        indices = np.argwhere(is_occupied)[:, ::-1]  # as (x, y, z)
         halves = BoxCells(
             self.origin + self.cell_size * indices, np.full(3, self.cell_size)
         ).octants()

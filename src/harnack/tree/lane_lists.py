@@ -130,8 +130,8 @@ def traverse_subtrees(
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         """Visit node i of the subtree of list entry k; `end` is the node after that subtree. If i
-        equals `end`, begin the subtree of entry k instead. Returns the next k, i and `end`, and
-        then the new state."""
+        equals `end`, begin the subtree of entry k instead. `visit` is the caller's function.
+        Returns the next k, i and `end`, and then the new state."""
         # At the start i and end are both 0, so that the first subtree begins.
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))

@@ -111,6 +111,7 @@ class OctreeLookup:
         position = (x - self.lower_corner) * self.cells_per_length
         is_inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
         ix, iy, iz = (index(dr.select(is_inside, position[k], 0)) for k in range(3))
+        # self.top_grid has the encoded node for each cell of the uniform grid.
         # Integer coordinates in cells of the greatest depth. Their upper bits give the cell of the
         # uniform grid, the other `down` bits one octant for each further depth.
         down = MAX_DEPTH - _TOP_DEPTH

@@ -279,15 +279,19 @@ class TriangleTree:
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """The new state: the crossing with the triangle in the record `row`, if it comes after
-            `after` and before the best crossing so far, which is `state`; otherwise `state`."""
+            the crossing `after` = (`t_after`, `n_after`), not after t_max, and before the best
+            crossing so far, which is `state`; otherwise `state`. With `reach` more than 0, a border
+            within that distance of the ray counts as crossed."""
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             # The triangle of an empty slot, number -1, has no area: its sign is 0.
             n = index(fmax(row[NUMBER_COLUMN], real(0)))
+            # After NO_TRIANGLE no triangle is left at the same t.
             is_after = (t > t_after) | ((t == t_after) & (n > n_after) & (n_after != NO_TRIANGLE))
             is_before_best = (t < best) | ((t == best) & (n < number))
             is_crossed = new_sign != 0
             if reach > 0:
+                # A border near an end of the ray does not count.
                 is_off_ends = (t > 2 * reach) & (t < t_max - 2 * reach)
                 is_crossed |= is_off_ends & _is_beside(row, frame, reach)
             is_chosen = active & is_crossed & is_after & is_before_best & (t <= t_max)
@@ -351,7 +355,8 @@ class TriangleTree:
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """The new state (sum, mask): the sign of the crossing with the triangle in the record
             `row` is added to the sum if the crossing is between 0 and `end`. The mask becomes False
-            if rounding may have decided whether it is between them."""
+            if rounding, of `unit` for each coordinate, may have decided whether it is between
+            them."""
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
@@ -387,9 +392,10 @@ class TriangleTree:
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if its box, slightly enlarged, meets the vertical ray. state: the sum so
-            far. Returns the mask of lanes that enter the node, and the state, to which the
-            triangles of a leaf have been added."""
+            """Enter a node if its box, enlarged by `pad`, meets the vertical ray from x. `low_x` to
+            `high_y` are the coordinates of x, less or more by `pad`; `height` is z, or for rays
+            downwards -z. state: the sum so far. Returns the mask of lanes that enter the node, and
+            the state, to which the triangles of a leaf have been added."""
             # For rays downwards, z and the ray are mirrored: the upper end of the box is at -z0.
             x0, y0, z0, x1, y1, z1 = node.head
             is_met = (
@@ -425,8 +431,9 @@ class TriangleTree:
         pad = 16 * backend.machine_epsilon * (1 + size) + reach
 
         def may_meet(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
-            """Whether the ray comes within `reach` of the node's box, up to rounding, for a t
-            between t_min and t_max."""
+            """Whether the ray o + t d comes within `reach` of the node's box, up to rounding, for a
+            t between t_min and t_max. `pad` is `reach` plus a bound of the rounding; `inverse` is
+            one over d, for each coordinate."""
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
             # The t at which the ray passes the box's planes; it is in the box from near to far.
             a, b = (low - o) * inverse, (high - o) * inverse
@@ -568,6 +575,8 @@ def _crossing_depth(
     max_w = fmin(
         (1 - ray_position) / (1 - apex_position), fmin(ray_position / apex_position, type(ab)(1))
     )
+    # w: the area at the longest edge over the triangle's area. The triangle runs the edge ac from c
+    # to a, hence the minus sign.
     w = clamp(select_longest(ab, bc, -ac) / (bc - ac + ab), zero, max_w)
     s = clamp(dr.fma(-w, apex_position, ray_position), zero, 1 - w)
     t = dr.fma(s, end[2] - start[2], dr.fma(w, apex[2] - start[2], start[2]))

@@ -164,11 +164,13 @@ class BoundaryCells:
         roundings of x.
         """
         # cell_sums: the sums in the cell of x. turns: the number of triangles that the line from
-        # its center to x crosses, counted with signs. value: w modulo 1.
+        # its center to x crosses, counted with signs. value: w modulo 1. self.rays: the tree of the
+        # mesh's triangles. self.center_values: w at the centers of the cells.
         backend, real = self.cells.backend, self.cells.backend.Float
         cell_sums, inside = self.cells.sums(x, active)
         displacement = x - cell_sums.center
         distance = dr.norm(displacement)
+        # At the center itself the line to x has no direction.
         inside &= distance > _TRIANGLE_ROUNDINGS * unit
         direction = dr.select(inside, displacement / distance, backend.Array3f(0, 0, 1))
         frame = RayFrame.along(backend, cell_sums.center, direction)

@@ -96,8 +96,8 @@ class FieldWithCells(Field):
                 f"cells must be True, False, a number of megabytes or None, not {cells!r}"
             )
         self.cells = cells
-        # `with_cells` results by `finer_cells`; and built cells by backend, bytes and
-        # `finer_cells`.
+        # finer_cells: cells that the user requests are of the smaller kind. The two caches: results
+        # of `with_cells` by `finer_cells`; and built cells by backend, bytes and `finer_cells`.
         self.cells_for_values, self.finer_cells = bool(cells), True
         self._with_cells: TransientCache[bool, Self] = TransientCache()
         self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
@@ -160,7 +160,7 @@ class FieldWithCells(Field):
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
         if not self.cells:
             return {}
-        if self._device is None:
+        if self._device is None:  # not prepared
             return {"cells": f"of at most {self.max_bytes() / 1e6:g} MB"}
         if built is None:
             return {"cells": "none, as they need more memory"}

@@ -108,7 +108,7 @@ class DenoisedCloud:
                 known_normals[cloud.selected],
             )
         noise, spacing = cloud.noise.deviation, cloud.spacing
-        # As a multiple of the spacing.
+        # As a multiple of the spacing. It grows with the root of the noise, up to a limit.
         smoothing = min(_SMOOTHING, _SMOOTHING_OF_ROOT * (noise / spacing) ** 0.5)
         report = {
             "given": total,

@@ -111,7 +111,7 @@ class DipoleTree:
         build: a function that builds cells from the moments of the tree's nodes and the records of
             the dipoles (in NumPy, and on the backend); None for no cells.
         """
-        # Each dipole is a source with one position and one moment, and its own center.
+        # Each primitive is a single dipole, and its box is the dipole's position.
         levels = dipole_tree_moments(tree, points[:, None], moments[:, None], points, points)
         rows = dipole_records(points, moments)
         # Column 6 is |m_i|; the rounding is proportional to the size of the sum.
@@ -153,6 +153,7 @@ class DipoleTree:
         Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
         one by one, and not by the moments of a node.
         """
+        # self.clusters: the tree with its multipole moments.
         add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
         sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
         return sums, state[0]
@@ -378,7 +379,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         self.fit_report: dict[str, Any] = {}
         if isinstance(smoothing, str):  # "auto"
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
-            # What `replace` changes is the denoised cloud.
+            # `replace` makes a changed field from the recorded arguments: those of the denoised
+            # cloud.
             record_arguments(self, normals=normals, smoothing=smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
@@ -595,8 +597,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
         ) -> DipoleCells | None:
-            """Return the cells that were built before, or build them. Returns None if they would
-            take too much memory.
+            """Return the cells of the cube [-half, half]^3 that were built before, or build them.
+            Returns None if they would take too much memory.
 
             levels: the multipole moments of the tree's nodes, one entry for each level of the tree.
             rows: the records of the dipoles, in the slots of the tree's leaves.

@@ -117,9 +117,10 @@ class SlicedKernel(RadialKernel):
 
     def at(self, distance: Real, inverse: Real, last: int) -> KernelValues:
         """Compute the functions psi_0, ..., psi_last at a distance D in four dimensions. psi_k is a
-        constant times i_(k+1)/D^(2k+1), with the integrals i_n of the class docstring. The integral
-        with the largest n comes from a polynomial, and all others from the recurrence i_n = (2n s^2
-        i_(n+1) + c)/(2n-1), where c = w/D and s = r/D.
+        constant times i_(k+1)/D^(2k+1). Here i_n is D^(2n-1) times the integral of
+        dv/(r^2 + v^2)^n over v from w to infinity, a function of c = w/D. The integral with the
+        largest n comes from a polynomial, and all others from the recurrence
+        i_n = (2n s^2 i_(n+1) + c)/(2n-1), where s = r/D.
 
         distance: D; not used.
         inverse: 1/D.
@@ -127,6 +128,7 @@ class SlicedKernel(RadialKernel):
         """
         del distance
         # c = w/D, s2 = (r/D)^2; moment: i_(k+1), from k = last down; theta_k = psi_k D^(2k+1).
+        # `inverse` in the result is the factor 1/D that all psi_k have in common, beside 1/D^(2k).
         c = self.height * inverse
         s2 = dr.fma(-c, c, 1)
         moment = _horner(dr.fma(2, c, -1), moment_polynomial(last + 1, self._degree))
@@ -161,7 +163,7 @@ class SlicedKernel(RadialKernel):
 
 @functools.cache
 def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
-    """Fit a polynomial to the integral i_n(c) of `SlicedKernel` for c in [0, 1].
+    """Fit a polynomial to the integral i_n(c) of `SlicedKernel.at` for c in [0, 1].
 
     n: the index of the integral.
     degree: the degree of the polynomial, whose variable is 2c - 1.
@@ -176,12 +178,13 @@ def moment_polynomial(n: int, degree: int) -> tuple[float, ...]:
         """Compute the values of i_n at x = 2c - 1. x: (k,) numbers in [-1, 1].
 
         With c = cos phi, i_n is phi/sin phi times the integral over t in [0, 1] of
-        (sin(phi t)/sin phi)^(2n-2).
+        (sin(phi t)/sin phi)^(2n-2). `t` and `weight` are the nodes and weights of Gauss's rule.
         """
         phi = np.arccos(0.5 * (x + 1))[:, None]
         ratio = np.sin(phi * t) / np.sin(phi)
         return phi[:, 0] / np.sin(phi[:, 0]) * (ratio ** (2 * n - 2) @ weight)
 
+    # The nodes lie inside of (-1, 1), so that phi is not 0.
     nodes = chebyshev.chebpts1(2 * degree)
     series = chebyshev.chebfit(nodes, moment(nodes), degree)
     return tuple(float(coefficient) for coefficient in chebyshev.cheb2poly(series))
@@ -247,6 +250,7 @@ def quadrature_points(corners: FloatArray, longest: float) -> QuadraturePoints:
         of space and face the same way are merged: they get a single point.
     """
     # A kind of triangles that does not occur has no part.
+    # The ratios bound, for each point, moments of its group relative to |m|: the largest count.
     is_small = _longest_edges(corners) <= _CELL_FRACTION * longest
     parts = [
         make_points(triangles, longest)
@@ -314,7 +318,8 @@ def _subdivide(corners: FloatArray, longest: float) -> QuadraturePoints:
         middle = a[:, None] + u[:, None] * (b - a)[:, None] + v[:, None] * (c - a)[:, None]
         points.append(middle.reshape(-1, 3))
         moments.append(np.repeat(_areas(triangles) / count**2, count**2, axis=0))
-    # A piece is 1/count times as large as its triangle, in all lengths.
+    # A piece is 1/count times as large as its triangle, in all lengths. The integral of |d|^2 over
+    # |m| is the mean of |d|^2 over the piece, as |m| is its area.
     second_ratio = float((_mean_squares(corners) / counts**2).max())
     farthest = float((_corner_distances(corners, corners.mean(axis=1)) / counts).max())
     return QuadraturePoints(
@@ -416,8 +421,9 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         super().__init__()
         self.heights = (w, gap - w)  # of the slice above mesh a, and below mesh b
         self.spacing, self.accuracy = spacing, accuracy
-        low = np.min([pair.min(axis=(0, 1)) for pair in corners], axis=0)
-        high = np.max([pair.max(axis=(0, 1)) for pair in corners], axis=0)
+        # corners: (m, 3, 3) for each of the two meshes.
+        low = np.min([mesh.min(axis=(0, 1)) for mesh in corners], axis=0)
+        high = np.max([mesh.max(axis=(0, 1)) for mesh in corners], axis=0)
         self._box = low, high
         self._center = round_to_single(0.5 * (low + high))
         # A power of two, so that lengths are scaled without rounding.
@@ -428,7 +434,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         self._pieces = tuple(
             quadrature_points(*pair) for pair in zip(corners, longest, strict=True)
         )
-        self._dipoles = tuple(self._dipole_tree(pair) for pair in self._pieces)
+        self._dipoles = tuple(self._dipole_tree(points) for points in self._pieces)
         self._extents: TransientCache[tuple[float, ...], Volume] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
 
@@ -585,6 +591,7 @@ class _SliceBuffers(UnitFrame):
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         """
         sums = RadialSums.zero(self.backend, derivatives)
+        # A cloud is the sum over the quadrature points of one mesh.
         for cloud in self.clouds:
             sums = cloud.accumulate(sums, x, closer)
         return sums
@@ -596,14 +603,15 @@ class _SliceBuffers(UnitFrame):
         detail: the accuracy scale; larger is more accurate.
         """
         x = self.to_unit(p)
-        radial = self.sums(x, detail, 1)
+        radial = self.sums(x, detail, 1)  # 1: with gradients
         sums = radial.sums
         # Of the rounding of positions (s4 is a sum that bounds it), and of truncation.
         slope_error = dr.fma(
             SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
         )
-        # A lower bound of the distance, in four dimensions, to the nearest quadrature point; and
-        # the range of f on the ball around x of radius r.
+        # A lower bound of the distance, in four dimensions, to the nearest quadrature point, also
+        # after rounding; and the range of f on the ball around x of radius r, a ball in four
+        # dimensions, in which f is harmonic.
         nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
         nearest = fmax(nearest, 0)
         r = BALL_FRACTION * nearest

@@ -117,7 +117,7 @@ class FaceLoops:
     def face(self, index: Any) -> FaceSolidAngle:
         """The solid angle of the face with this index, as a field. The index may differ from lane
         to lane."""
-        row = self.heads.read_record(index)
+        row = self.heads.read_record(index)  # self.heads: one record for each face
         backend = self.heads.backend
         integer = backend.UInt32
         # The columns of `upload`: center, size, index of the first record, signed number of
@@ -389,15 +389,16 @@ def _are_empty(
 
     Proof. Let h be the radius, less than the distance d_e of the center from every edge e, of
     length 2a. There is no level in the ball if no level lies in [f - S, f + S], where f is the
-    value at the center and S bounds the change of the lift within h. The smaller of two bounds is
-    used:
+    value at the center. Here S bounds the change, within h, of the lift (f without jumps of 4 pi).
+    The smaller of two bounds is used:
 
-    - At distance s from the center, an edge's field is at most 2a/((d_e - s) sqrt((d_e - s)^2 +
-      a^2)) (`LiftedEdge.bounds`), whose integral is S = sum_e 2 [asinh(a/(d_e - h)) -
-      asinh(a/d_e)].
-    - The second derivative along a line is at most 2 sum_e int rho^-3 over the edge, and that
-      integral at most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`): with the
-      gradient at the center, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
+    - At the distance s from the center, an edge's part of grad f is at most
+      2a/((d_e - s) sqrt((d_e - s)^2 + a^2)) (`LiftedEdge.bounds`). Its integral over s from 0 to h
+      gives S = sum_e 2 [asinh(a/(d_e - h)) - asinh(a/d_e)].
+    - The second derivative along a line is at most 2 times the sum over e of the integral of
+      rho^-3 along the edge, where rho is the distance to a point of the edge. That integral is at
+      most 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)) (`LiftedEdge.bounds`). With the gradient at the
+      center, S = |grad f| h + h^2 sum_e 2a/((d_e - h)^2 sqrt((d_e - h)^2 + a^2)).
 
     A ball that contains a point of the curve is never empty.
     """
@@ -411,8 +412,8 @@ def _are_empty(
     def add(p: Vec3, q: Vec3, inverse: Real, state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge from p to q to the state, and return the new state. It holds the product
         (zr, zi) of the edges' factors, the gradient, the distance of the nearest edge, and the sums
-        over edges in the two bounds S. The argument of an edge's factor is half the solid angle of
-        the edge.
+        over edges in the two bounds S for the ball of radius h around x. The argument of an edge's
+        factor is half the solid angle of the edge.
 
         inverse: 1/|q - p|^2.
         """
@@ -479,7 +480,8 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     over_relaxation: float = 1.3  # as for `SolidAngle`
 
     def __init__(self, vertices: Any, faces: Any) -> None:
-        """Validate vertices and faces. The parameters are described at the class."""
+        """Validate vertices (n, 3) and faces, a list of polygons: each is a list of indices of
+        vertices, or a list of such loops."""
         super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.face_count >= MAX_BOXES:

@@ -105,6 +105,7 @@ class YukawaKernel(RadialKernel):
         """
         # Farther away exponentials are not computed, as they would underflow.
         t = fmin(self.kappa * distance, MAX_LENGTHS)
+        # First the factor that all psi_k have in common, beside the powers 1/rho^(2k).
         return KernelValues(dr.exp(-t) * inverse, thetas(t, last))
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
@@ -315,8 +316,14 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         accuracy: float = 6.0,
     ) -> None:
         """Validate the points, choose the method, scale the points to unit coordinates, and compute
-        the default level. The parameters (points, normals, areas, length, method, accuracy) are
-        described at the class."""
+        the default level.
+
+        points, normals: (n, 3), normals of any length.
+        areas: (n,) the areas that the points stand for; None estimates them.
+        length: the screening length.
+        method: "sum" (all dipoles), "tree" (clusters of far dipoles), or "auto".
+        accuracy: for the tree; larger is more accurate.
+        """
         super().__init__()
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
@@ -470,6 +477,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         detail: the accuracy scale; larger is more accurate.
         """
         x = on.to_unit(p)
+        # 1: with gradients.
         screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
         sums, unit = screened.sums, coordinate_rounding(x)
         cutoff, slope, _ = self._cutoff_errors(on, sums, unit)
@@ -522,7 +530,7 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
             t = self._kappa * distance
             may_have_level = total * (1 + t) * math.exp(-t) > min_level * distance * distance
             low, high = (distance, high) if may_have_level else (low, distance)
-        distance = 1.001 * high * self._size
+        distance = 1.001 * high * self._size  # a little larger, for rounding
         lower, upper = self.points.min(axis=0) - distance, self.points.max(axis=0) + distance
         return tight_extent(self, levels, lower, upper, _MAX_CELLS)
 

@@ -78,6 +78,7 @@ class SmoothedKernel(RadialKernel):
         for k in range(last + 1):
             thetas.append(dr.fma((2 * k + 1) * double_factorial, half_q, double_factorial))
             double_factorial *= 2 * k + 1
+        # First the factor that all psi_k have in common, beside the powers 1/D^(2k).
         return KernelValues(inverse, thetas)
 
     def bounds(self, distance: Real, last: int) -> list[Real]:
@@ -142,8 +143,8 @@ class SmoothedSum:
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """A sample of f at points x: value, gradient, errors and proved bounds of second
         derivatives near x. detail: the accuracy scale; larger is more accurate."""
+        # radial: with gradients, and with sums for bounds near x. sums: value, gradient and errors.
         radial = self.dipoles.sums(x, detail, 1)
-        # radial: with sums for bounds near x. sums: value, gradient and errors.
         sums = radial.sums
         # The error of the gradient: of positions, and of truncation.
         slope_error = dr.fma(

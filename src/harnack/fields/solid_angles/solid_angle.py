@@ -154,7 +154,13 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         cells: bool | float | None = None,
     ) -> None:
         """Validate the curve, remove edges that cancel each other, and decide how the range of the
-        lift is bounded. The parameters (loops, lift_bound, cells) are described at the class."""
+        lift is bounded.
+
+        loops: the closed curves: arrays (n, 3) of vertices, or circles; one of them or a list.
+        lift_bound: the way in which that range is bounded ("auto" to choose).
+        cells: whether to build FMM cells: True, False, None if they save time, or the number of
+            megabytes that they may take.
+        """
         super().__init__()
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
@@ -544,7 +550,7 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
         data = self._data_for(p)
         if self._all_cancel:
-            return 0 * p.x
+            return 0 * p.x  # f is constant: 0 on each lane
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
         sums = data.sums(x)
@@ -908,8 +914,8 @@ def _line_bounds(
 
     def rates(lengths: tuple[Real, ...], active: Mask) -> tuple[Real, ...]:
         """For each length T in `lengths`, a bound of |df/ds| at the points x + s v of the line with
-        |s| <= T, summed over edges and circles. Returns one bound for each length. It is infinite
-        on lanes that are not active."""
+        |s| <= T, summed over the edges and circles of the curve `data`. Returns one bound for each
+        length. It is infinite on lanes that are not active."""
         summands: list[tuple[Real, ...]] = []
         if data.edges is not None:
             summands.append(data.edge_rates(errors, line, lengths, active))

@@ -118,6 +118,7 @@ class ExactWinding:
         ray_sign = dr.select(x.z >= 0, self.backend.Float(1), -1)
         # The signed number of crossings of the ray from each x.
         turns = self.rays.signed_crossings_vertical(x, ray_sign)
+        # self.trails, self.edges: the boundary edges in two forms; None for a closed mesh.
         if self.trails is None or self.edges is None:
             return dr.select(ray_sign > 0, turns, 0 - turns)  # 0 - 0 is 0, but -(0) is -0
         dr.eval(x, ray_sign, turns)
@@ -125,6 +126,7 @@ class ExactWinding:
         value = ray_sign * (turns + edge_turns)
         dr.eval(value, is_uncertain)
         uncertain_ids = dr.compress(is_uncertain)
+        # 0: without derivatives.
         if len(uncertain_ids):
             dr.scatter(
                 value, self.values(dr.gather(type(x), x, uncertain_ids), 0).value, uncertain_ids
@@ -172,7 +174,8 @@ class ExactWinding:
             return Sample(self.backend.Float(turns), zero, (Lipschitz(0.0),), 0.0)
         if self.ray_trails is None or self.loops is None:
             raise RuntimeError("uploaded for points and not for rays")
-        # 4 pi w: the solid angles of edges, and 4 pi for each crossing ahead.
+        # self.ray_trails, self.loops: the boundary edges, for sums along rays and for bounds along
+        # lines. sums: 4 pi w, the solid angles of edges, and 4 pi for each crossing ahead.
         sums = self.ray_trails.sum(frame, x, active)
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         unit = fmax(coordinate_rounding(frame.o), coordinate_rounding(x))

@@ -80,7 +80,7 @@ class WindingMesh:
             raise MeshError(
                 f"faces: at most {MAX_TRIANGLES - 1} are possible; cut the mesh in parts"
             )
-        # A singular edge occurs as often as its weight says.
+        # In the order of the attributes. A singular edge occurs as often as its weight says.
         return cls(
             x,
             net.faces,
@@ -108,9 +108,11 @@ class WindingMesh:
                 f"vertices: {len(x)} of them, where {len(self.vertices)} were before: moving "
                 "vertices keeps their number and their order"
             )
-        # Vertices that are no longer at the place of the vertex that stands for them.
+        # Vertices that are no longer at the place of the vertex that stands for them, whose index
+        # is in self.weld_map.
         has_moved = (x != x[self.weld_map]).any(axis=1)
-        # If positions that differed by rounding were joined, they may differ by rounding again.
+        # If positions that differed by rounding were joined (self.rounded is their number), they
+        # may differ by rounding again.
         if self.rounded and has_moved.any():
             has_moved = np.abs(x - x[self.weld_map]).max(axis=1) > rounding_of(x)
         if has_moved.any():

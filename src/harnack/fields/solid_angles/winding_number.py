@@ -115,7 +115,7 @@ class WindingModuloOne(Field):
     period: ClassVar[float | None] = 1.0
 
     def __init__(self, winding: ModuloOneEvaluable) -> None:
-        """The parameter `winding` is described at the class."""
+        """winding: the object that evaluates w."""
         self._winding = winding
 
     def prepare(self, backend: Backend) -> Self:
@@ -130,7 +130,7 @@ class WindingModuloOne(Field):
 
     @property
     def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the field is sampled with another accuracy."""
+        """How the field is sampled with another accuracy; never None here."""
         return VariableAccuracy(
             lambda scale: EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, scale))
         )
@@ -297,8 +297,16 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         order: int = 2,
         cells: bool | float | None = None,
     ) -> None:
-        """Validate the mesh and the options, and choose the method. The parameters (vertices,
-        faces, method, accuracy, order, cells) are described at the class."""
+        """Validate the mesh and the options, and choose the method.
+
+        vertices, faces: (n, 3) and (m, 3), the mesh.
+        method: "exact", "tree" or "auto".
+        accuracy: for the tree, the moments of a cluster are used beyond this many times its radius;
+            None for the default.
+        order: the order of the tree's multipoles: 0, 1 or 2.
+        cells: whether to build FMM cells: True, False, None if they save time, or the number of
+            megabytes that they may take.
+        """
         super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
@@ -377,6 +385,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
+                # Second derivatives from the edges, and only the value from the tree.
                 rates = self._boundary_rates(data, winding).at(x, 2, closer)
                 values = with_rates(winding.values(x, 0, closer), rates)
             else:
@@ -396,7 +405,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         data = self._batch_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
-            return self.values_at(x, 1)
+            return self.values_at(x, 1)  # 1: with gradients
         x = data.to_unit(x)
         # So that the kernels below read x, and do not compute it again.
         dr.eval(x)
@@ -507,7 +516,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
     @property
     def jumps(self) -> Jumps | None:
-        """The triangles, across which w jumps."""
+        """The triangles, across which w jumps; never None here."""
         return _TriangleJumps(self, self._data_for, self._level_of_sheets)
 
     @property
@@ -621,7 +630,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
 
 class _TriangleJumps(Jumps):
-    """The triangles of a mesh, across which its winding number w jumps by an integer.
+    """The triangles of a mesh, across which its winding number w jumps by an integer. `data_for`
+    returns the mesh on the device of points p, in unit coordinates.
 
     field: the winding number.
     data_for: a function that returns the mesh on the device of points p.
@@ -632,7 +642,9 @@ class _TriangleJumps(Jumps):
     def __init__(
         self, field: WindingNumber, data_for: Callable[[Vec3], _WindingData], level: float | None
     ) -> None:
-        """The parameters are described at the class."""
+        """field: the winding number. data_for: a function that returns the mesh on the device of
+        points p. level: the level that the field takes at the triangles and nowhere else, if the
+        mesh is the whole surface; otherwise None."""
         self.field, self.data_for, self.level = field, data_for, level
         self.takes_all_levels = level is not None
 
@@ -701,7 +713,7 @@ class _TriangleJumps(Jumps):
 
     def mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
         """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
-        closed."""
+        closed. It is never None here."""
         return (
             self.field.mesh.vertices,
             self.field.mesh.triangles,
@@ -709,7 +721,7 @@ class _TriangleJumps(Jumps):
         )
 
     def smooth_field(self) -> Field | None:
-        """The winding number modulo 1, which is continuous across triangles."""
+        """The winding number modulo 1, which is continuous across triangles; never None here."""
         return WindingModuloOne(self.field)
 
     def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
@@ -725,7 +737,8 @@ class _CellSamples(ModuloOne):
     """
 
     def __init__(self, field: WindingNumber, data: _WindingData) -> None:
-        """The parameters are described at the class."""
+        """field: the winding number, prepared with FMM cells of edges. data: the mesh and its cells
+        on the backend."""
         self.field, self.data = field, data
 
     @property
@@ -810,14 +823,18 @@ class _WindingOnInterval(Field):
         offset: Real,
         detail: Real = 1.0,
     ) -> None:
-        """The parameters are described at the class."""
+        """on: the mesh on a backend. frame: the rays, in unit coordinates. behind: the crossing at
+        the start of the interval, in unit coordinates. offset: the signed number of crossings
+        beyond the start; only the exact method uses it. detail: the accuracy scale; larger is more
+        accurate."""
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
 
     @property
     def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the function is sampled with another accuracy. If there are FMM cells of edges,
-        coarse samples may give w only up to an unknown integer."""
+        """How the function is sampled with another accuracy; None if all samples are equally
+        accurate. If there are FMM cells of edges, coarse samples may give w only up to an unknown
+        integer."""
         winding, has_cells = self._on.winding, self._on.cells is not None
         if not (winding.has_detail or has_cells):
             return None
@@ -863,8 +880,8 @@ class _BesideSheets(Field):
     def __init__(
         self, backend: Backend, level: float, behind: JumpCrossing, ahead: JumpCrossing
     ) -> None:
-        """The parameters level, behind and ahead are described at the class. backend: that of the
-        crossings."""
+        """backend: that of the crossings. level: the level of the surface. behind, ahead: the
+        crossings at the ends of the interval."""
         real = backend.Float
         # A positive jump ahead leads up through the level, so that the field is below it before.
         # After a positive jump behind the field is above it. A jump of 0 means that there is no

@@ -117,7 +117,8 @@ def edges_of(row: list[Real], x: Vec3, frame: RayFrame | VerticalRayFrame) -> It
     """
     ends = corners_of(row, cast("Any", type(x)))
     for k, (i, j, sign) in enumerate(_EDGES):
-        # Empty slots have the triangle number -1.
+        # sign: -1 for the edge that a triangle runs from j to i. Empty slots have the number -1;
+        # for them 0 marks an edge of length 0.
         inverse = dr.select(row[NUMBER_COLUMN] >= 0, row[INVERSE_SQUARES_COLUMN + k], 0)
         edge = LiftedEdge.between(ends[i], ends[j], sign * row[PARITY_COLUMN], inverse, frame, x)
         yield NearEdge(edge, row[SINGULAR + k] > 0)
@@ -242,15 +243,16 @@ class TreeWinding:
         start = LiftedProduct.identity(self.backend.Float).parts()
 
         def adder(reach: Real) -> AddPrimitive:
-            """Make the function that adds a near triangle to sums, where nodes are far beyond
-            `reach` times their radius."""
+            """Make the function that adds a near triangle to sums at points x of the rays `frame`,
+            where nodes are far beyond `reach` times their radius."""
 
             def add(
                 row: list[Real], active: Mask, sums: SourceSums, state: tuple[Any, ...]
             ) -> tuple[SourceSums, tuple[Any, ...]]:
-                """Add the triangle in the record `row` to the sums, on active lanes. state: the
-                parts of the product of the edges' factors so far (`LiftedProduct`). Returns the new
-                sums and the new state."""
+                """Add the triangle in the record `row` to the sums, on active lanes: its crossing
+                with the ray of `frame`, if `is_ahead` says that it is ahead of x, and its open
+                edges. state: the parts of the product of the edges' factors so far
+                (`LiftedProduct`). Returns the new sums and the new state."""
                 t, sign = signed_crossing(row, frame)
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
@@ -358,15 +360,16 @@ class TreeWinding:
             active = active & active_lanes
 
             def adder(reach: Real) -> AddPrimitive:
-                """Make the function that adds the open edges of a near triangle to the bounds,
-                where nodes are far beyond `reach` times their radius."""
+                """Make the function that adds the open edges of a near triangle to the bounds for
+                the line `line` and for each of `lengths`, where nodes are far beyond `reach` times
+                their radius."""
 
                 def add(
                     row: list[Real], active: Mask, sums: SourceSums, old: tuple[Any, ...]
                 ) -> tuple[SourceSums, tuple[Any, ...]]:
-                    """Add the open edges of the triangle in the record `row` to the bounds `old`,
-                    one for each length, on active lanes. Returns the sums over far clusters,
-                    unchanged, and the new bounds."""
+                    """Add the open edges of the triangle in the record `row` to the bounds `old` of
+                    the change along `line`, one for each of `lengths`, on active lanes. Returns the
+                    sums over far clusters, unchanged, and the new bounds."""
                     # Of the edges only the positions relative to x are used. The rays matter only
                     # for their solid angles, so any direction does.
                     for near_edge in edges_of(row, line.x, VerticalRayFrame(line.x)):
