@@ -246,6 +246,7 @@ class RiemannSurface(Field):
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
         if not np.isfinite(corners).all():
             return math.inf
+        # The first and the last corner are opposite.
         middle = 0.5 * (corners[0] + corners[3])
         reach = max(abs(corner - middle) for corner in corners)
         return abs(self.height) * self.branches.max_abs(middle, reach)

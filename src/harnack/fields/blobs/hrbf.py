@@ -429,6 +429,7 @@ def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
     r = dr.sqrt(r_squared)
     inverse_r = 1 / fmax(r, tiny)
     u = x * inverse_r
+    # In this order: r x, u, (h^2 + 2x^2)/r, h^2/r^3, 3u - u^3.
     return _TermFunctions(
         r * x,
         u,
