@@ -679,7 +679,8 @@ class SolidOfRevolution(Solid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        return outline_distance_jet(_prepared_for(self, x.width)._outline.nearest, norm(x, y), z)
+        solid = _prepared_for(self, x.piece_length)
+        return outline_distance_jet(solid._outline.sample, norm(x, y), z)
 
 
 def _from_axis(p: Vec3) -> tuple[Real, tuple[Real, Real]]:
