@@ -417,7 +417,8 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             """
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
-            # `stream` is the video in the file `container`.
+            # `stream` is the video in the file `container`. Its format needs even sides, so an odd
+            # last row or column is cut off.
             height, width = (side - side % 2 for side in pixels.shape[:2])
             # The size is set by the first picture, which a color bar may have widened.
             if not stream.codec_context.is_open:

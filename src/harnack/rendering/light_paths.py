@@ -458,6 +458,7 @@ class RefractionTracer:
             & first.is_hit
             & (interface_count <= _MAX_INTERFACES)
         )
+        # The refractive index; 1, which is not used, for what is no transparent solid.
         index = mi.Float(1)
         for proxy, value in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)

@@ -79,9 +79,8 @@ class ConeCoverage:
         t = dr.select(dr.isfinite(distance), distance, dr.largest(mi.Float))
         # The vectors to the neighboring pixels span one pixel at distance 1.
         to_right, to_below = ray.d_x - ray.d, ray.d_y - ray.d
-        radius = 0.5 * dr.maximum(
-            dr.norm(to_right + to_below), dr.norm(to_right - to_below)
-        )  # half the longer diagonal
+        # Half the longer diagonal.
+        radius = 0.5 * dr.maximum(dr.norm(to_right + to_below), dr.norm(to_right - to_below))
         is_covered = dr.zeros(mi.Bool, dr.width(ray.d))
         for placed, balls in self.placed:
             is_covered |= placed.covers_in_part(ray.o, ray.d, radius, t, balls)

@@ -217,9 +217,8 @@ def reflectance(color: Any, painted: Any) -> Any:
     """
     painted_color = color
     largest_channel = dr.max(color)
-    metal = (
-        dr.square(color / largest_channel) * _METAL
-    )  # light in a mirror is reflected more than once
+    # The square, as light in a mirror is reflected more than once.
+    metal = dr.square(color / largest_channel) * _METAL
     color = dr.select(largest_channel > 1, metal, color)
     return dr.select(
         painted, painted_color, dr.select(largest_channel > 0, color, _like(color, _CLEAR))

@@ -113,14 +113,14 @@ class ExtensionBounds:
         wavenumbers, amplitudes = np.array(waves.wavenumbers), np.array(waves.amplitudes)
         # The mean square of |grad f| is half the sum of A_i^2 kappa_i^2.
         mean_slope = math.sqrt(0.5 * float(amplitudes**2 @ wavenumbers**2))
+        # One over the root mean square of the wavenumbers, weighted by A_i^2.
         length_unit = 1 / math.sqrt(
             float(amplitudes**2 @ wavenumbers**2) / float(amplitudes @ amplitudes)
         )
         # Radii from 0.02 to about 7 length units.
-        steps = (length_unit * 0.02 * 1.02**n for n in range(300))
-        radii = [
-            r for r in steps if r * float(wavenumbers.max()) < 30.0
-        ]  # cosh stays far from overflow
+        candidates = (length_unit * 0.02 * 1.02**n for n in range(300))
+        # So that cosh stays far from overflow.
+        radii = [r for r in candidates if r * float(wavenumbers.max()) < 30.0]
         trials = [cls.at(waves, r) for r in radii]
         return min(trials, key=lambda trial: trial._descent_at_zero(mean_slope) / trial.radius**2)
 

@@ -598,6 +598,7 @@ class RiemannSurface(Field):
             y, norm = dr.abs(y), abs(offset)
             for m in (0.5 * y, dr.power(y / constant, 1 / power) - norm):
                 radius = dr.power(fmax(y - m, 0) / constant, 1 / power) - norm
+                # The bound at a holds up to the distance `point.radius` from a.
                 radius = fmin(fmin(radius, point.radius - norm), m)
                 proved = fmax(radius, proved)
         return proved

@@ -91,6 +91,7 @@ class HRBF(Formula):
         margin = _MARGIN * float((upper - lower).max())
         self.domain = Box(lower - margin, upper + margin) if domain is None else domain
         self.lipschitz = self._largest_gradient()
+        # Set by `prepare`: the backend, and the table of the points' records on it.
         self._on: tuple[Backend, RecordTable] | None = None
 
     @cached_prepare

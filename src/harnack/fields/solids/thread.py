@@ -121,6 +121,7 @@ class Thread(Solid):
         # radian, so that u = z - _lead * angle.
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_frozen(self, "_lead", lead / (2 * math.pi))
+        # f is never less than -min_radius/2; near the axis it is this number.
         min_radius = min(b for _, b in rows)
         set_frozen(self, "_least", 0.5 * min_radius)
         max_radius = max(b for _, b in rows)
