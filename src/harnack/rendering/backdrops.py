@@ -132,7 +132,7 @@ def environment(azimuth: float) -> Any:
     height_fraction = np.clip(z, 0, 1)[..., None] ** 0.7
     image = _HORIZON + (_ZENITH - _HORIZON) * height_fraction
     # The middle of the strip is 125 degrees from the camera's azimuth, 28 above the horizon; its
-    # light falls off with the angle to this direction.
+    # light falls off with the angle to this direction, to 1/e at 31 degrees.
     strip_direction = _direction(azimuth + 125, 28)
     image += _STRIP * np.exp((direction @ strip_direction - 1) / 0.14)[..., None]
     return image.astype(np.float32)
