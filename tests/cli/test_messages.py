@@ -14,7 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.cli import main
-from harnack.cli.arguments import parsers
+from harnack.cli.arguments import parse, parsers
 from harnack.cli.messages import error_line, level_text, printable, python_to_cli_terms
 from harnack.field_from_file import field_from_file
 from harnack.files import FileFormatError
@@ -441,3 +441,10 @@ def test_points_too_large_for_single_precision_say_so() -> None:
 def test_a_mistyped_method_has_a_did_you_mean(method: str) -> None:
     with pytest.raises(ValueError, match="did you mean"):
         hk.WindingNumber(*icosphere(1), method=method)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["boundary-radius", "boundary_radius"])
+def test_a_slider_of_an_option_may_have_its_name_on_the_command_line(name: str) -> None:
+    """A hyphen was refused, though options are written with it."""
+    arguments = parse(["page", "x", "--slider", f"{name}=0.01:0.1"])
+    assert arguments.slider == [("boundary_radius", hk.Slider(0.01, 0.1))]

@@ -281,6 +281,18 @@ def test_operators_and_methods_read_like_the_drawing() -> None:
     assert len(flat.parts) == 3  # type: ignore[attr-defined]
 
 
+def test_a_solid_of_revolution_can_be_bent_and_blended() -> None:
+    ring = hk.SolidOfRevolution([(0.5, -0.5), (1.0, -0.5), (1.0, 0.5), (0.5, 0.5)])
+    points = [[0.75, 0.0, 0.1], [2.0, 0.0, 0.0]]
+    for solid in (ring.twisted(20.0), ring.blended(hk.Sphere(0.2), 0.1)):
+        np.testing.assert_allclose(solid.value(points), [-0.25, 1.0], atol=1e-5)
+    # The factor is 1.3 at z = 0.1 and 1.25 at z = 0.
+    tapered = ring.tapered((-0.5, 1.0), (0.5, 1.5)).value(points)
+    np.testing.assert_allclose(tapered, [0.5 - 0.75 / 1.3, 0.6], atol=1e-5)
+    hits = hk.trace(ring.twisted(20.0), [[3.0, 0.0, 0.1]], [[-1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(hits.t, 2.0, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_lower_bounds_of_distances_hold_for_parts_of_any_kind() -> None:
     """Harmonic fields promise no Lipschitz constant; one follows from their balls."""

@@ -7,6 +7,7 @@ import pytest
 
 import harnack as hk
 from harnack.gallery import SCENES
+from harnack.gallery.shells import _crossing_cosine
 from harnack.geometry import HalfSpace
 
 SHELLS = ("shell-ring", "shell-court", "shell-columns")
@@ -36,3 +37,12 @@ def test_beams_lie_on_the_shell(name: str) -> None:
     hits = hk.trace(shell, o, rng.permutation(points)[:300] - o)
     assert hits.is_hit.mean() > 0.95
     assert (hits.status != hk.RayStatus.OUT_OF_STEPS).all()
+
+
+def test_the_angle_to_a_line_of_two_points_is_never_chosen() -> None:
+    """It was NaN: such a line has no tangent at a point between two others."""
+    line = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    across = np.array([[1.0, -1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    assert _crossing_cosine(line, across) == 0.0
+    assert _crossing_cosine(line, across[:2]) == 2.0
+    assert _crossing_cosine(line[:2], across) == 2.0

@@ -413,17 +413,19 @@ def _parse_parameter(value: str) -> tuple[str, float]:
 
 
 def _parse_slider(value: str) -> tuple[str, Slider]:
-    """Return a name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5)). Raises a
+    """Return a name and a slider from text: "a=0:2:0.5" as ("a", Slider(0, 2, step=0.5)). The name
+    of an option may be written as on the command line, such as "boundary-radius". Raises a
     ValueError for any other text."""
     name, _, interval_text = value.partition("=")
+    name = name.strip().replace("-", "_")
     numbers = interval_text.split(":")
-    if not name.strip().isidentifier() or len(numbers) not in (2, 3):
+    if not name.isidentifier() or len(numbers) not in (2, 3):
         raise ValueError(
             f"{text.quoted(value)}: write a name and two ends as level=1:12, a step behind them as "
             "level=1:12:0.5"
         )
     low, high, *step = map(text.parse_level, numbers)
     try:
-        return name.strip().replace("-", "_"), Slider(low, high, step=step[0] if step else None)
+        return name, Slider(low, high, step=step[0] if step else None)
     except ValueError as wrong:
         raise ValueError(f"{text.quoted(value)}: {wrong}") from None

@@ -49,6 +49,7 @@ def _render(arguments: Any) -> int:
     if is_mitsuba_scene(arguments, path):
         surfaces, settings = load_mitsuba_scene(arguments)
     else:
+        # The third result, where the fields come from, is for scene files only.
         surfaces, settings, _ = load_content("render", arguments, path)
     render(surfaces, target, progress=not arguments.quiet, **settings)
     print_line(f"wrote {target}")
@@ -62,6 +63,7 @@ def _animate(arguments: Any) -> int:
     target = check_film_path(_output(arguments, path, ".gif", "film"))
     if is_mitsuba_scene(arguments, path):
         raise ValueError("a film needs a scene, a surface file or a formula, no Mitsuba scene")
+    # The third result, where the fields come from, is for scene files only.
     surfaces, settings, _ = load_content("animate", arguments, path)
     settings["show"] = arguments.show or "shaded"
     animate(surfaces, target, progress=not arguments.quiet, **settings)
@@ -73,6 +75,7 @@ def _page(arguments: Any) -> int:
     """Run the command `page`: write an HTML file in which the source's surface turns."""
     path = source_path(arguments)
     target = _output(arguments, path, ".html", "page")
+    # The third result, where the fields come from, is for scene files only.
     surfaces, settings, _ = load_live_content("page", arguments, path)
     page(surfaces, target, progress=not arguments.quiet, **settings)
     print_line(f"wrote {target} ({Path(target).stat().st_size / 1e6:.1f} MB)")

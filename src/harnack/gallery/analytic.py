@@ -48,6 +48,7 @@ def _levels() -> list[Surface]:
 def _holes() -> list[Surface]:
     """Return a surface spanned by a square with three holes. The curves are bent like a sheet in
     the wind, so that no plane contains them."""
+    # The square comes first; each hole has 24 vertices.
     edge, *holes = example_curves.square_with_holes(24)
     s = np.linspace(0, 1, 10, endpoint=False)[:, None]
     # Ten points on each side of the square, so that it can be bent.
@@ -117,6 +118,7 @@ def _quartic() -> list[Surface]:
 def _fitted_knot() -> list[Surface]:
     """Return a solid around a trefoil knot. Its field is a sum of Gaussians along the knot,
     approximated by a series of 16 x 16 x 9 cosines."""
+    # The trefoil is the (2, 3) torus knot, here of 150 vertices.
     curve = example_curves.torus_knot(2, 3, 150)
     # The lengths of the curve's edges are the weights of the sum.
     edge_lengths = np.linalg.norm(np.roll(curve, -1, axis=0) - curve, axis=1)

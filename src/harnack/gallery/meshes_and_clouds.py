@@ -77,6 +77,7 @@ def _knot_cloud() -> list[Surface]:
     """Return a surface through points on a tube around a trefoil knot. The points are arranged like
     the seeds of a sunflower."""
     n, count = 1200, 8000
+    # The trefoil is the (2, 3) torus knot, here of n vertices.
     curve = example_curves.torus_knot(2, 3, n)
     tangents = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)

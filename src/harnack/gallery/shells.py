@@ -203,9 +203,9 @@ def _relative_height(line: FloatArray, reach: float) -> float:
 
 def _crossing_cosine(line: FloatArray, other: FloatArray) -> float:
     """Return the absolute value of the cosine of the angle between two lines (k, 3), at their
-    points that are nearest to each other: 0 for a right angle; 2 if `line` has fewer than three
+    points that are nearest to each other: 0 for a right angle; 2 if a line has fewer than three
     points."""
-    if len(line) < 3:
+    if min(len(line), len(other)) < 3:
         return 2.0
     distance = np.linalg.norm(line[:, None] - other[None], axis=2)
     i, j = np.unravel_index(int(distance.argmin()), distance.shape)

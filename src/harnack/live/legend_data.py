@@ -47,6 +47,7 @@ def legends() -> dict[str, Any]:
     """
     out_of_steps_swatch = ["out of steps", css_color(OUT_OF_STEPS_COLOR)]
     hit_swatch = ["hit", css_color(STATUS_COLORS[RayStatus.HIT])]
+    # The end of the scale has a "+", as it stands for all larger numbers, too.
     ticks = [[float(evaluations_share(n)), str(n)] for n in _EVALUATIONS[:-1]] + [
         [1.0, f"{EVALUATIONS_TOP}+"]
     ]
@@ -65,6 +66,7 @@ def legends() -> dict[str, Any]:
         },
         "normal": {
             "title": "normal: x, y, z as red, green, blue",
+            # A normal n has the color (n + 1)/2; here it points along an axis, or against it.
             "swatches": [
                 *(
                     [f"+{axis}", css_color(0.5 + 0.5 * np.eye(3)[k])]

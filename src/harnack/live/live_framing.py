@@ -94,6 +94,7 @@ def _orbit(camera: Camera, placement: Placement, points: FloatArray) -> dict[str
     middle = 0.5 * (on_stage.min(axis=0) + on_stage.max(axis=0))
     # The middle may lie beside or behind the camera.
     distance = max(float((middle - pose.origin) @ forward), 1e-3)
+    # Azimuth and elevation say where the camera stands, opposite to where it looks.
     elevation = np.degrees(np.arcsin(np.clip(-forward[2], -1, 1)))
     # A vertical line of sight has no azimuth of its own.
     is_vertical = abs(forward[2]) > 1 - 1e-9

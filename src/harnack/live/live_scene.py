@@ -734,6 +734,7 @@ def encode_arrays(value: Any) -> Any:
     in base64. `decodeWords` in renderer.js reads it. The tables of meshes are repetitive and shrink
     to a tenth."""
     if isinstance(value, np.ndarray):
+        # mtime=0: no time of day in the data, so that equal arrays give equal texts.
         return base64.b64encode(gzip.compress(value.tobytes(), _LEVEL, mtime=0)).decode()
     if isinstance(value, dict):
         return {name: encode_arrays(entry) for name, entry in cast("JsonDict", value).items()}

@@ -87,8 +87,9 @@ def page(
 
     surfaces: a field, a `Surface`, or a list of them, as for `render`; or a function of sliders
         that returns them.
-    path: the file to write; it must end in .html or .htm. title: of the page; by default the
-        field's own text.
+    path: the file to write; it must end in .html or .htm.
+    title: the title of the page; by default the field's own text.
+    progress: whether a bar shows how much of the page is done, as for `render`.
     options, keywords: options of `render` and of traces: level, clip, tolerance, material, camera,
         up, boundary_radius, ..., and backdrop="light" or "dark". Options for still pictures alone
         are refused. The value of an option that is a number may be a `Slider`. Any other value may

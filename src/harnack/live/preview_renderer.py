@@ -130,7 +130,8 @@ class PreviewRenderer:
         # would then be evaluated separately.
         if has_floor and (is_idle or self.floor is None):
             self.floor = FloorShadow.of(_Casting(mi, painted), light)
-        # The width of a pixel at the hit, by its distance in the direction of view.
+        # The width of a pixel at the hit: that at distance 1 (`eye.pixel`), times the hit's
+        # distance in the direction of view.
         width = hits["t"] * eye.pixel * dr.dot(hits["d"], _vector(mi, eye.forward))
         sky = ambient_visibility(mi, hits["position"], hits["normal"], width, size)
         reflectance = reflectance_of(ground)
@@ -178,6 +179,7 @@ class PreviewRenderer:
         """
         columns, rows = (dr.opaque(mi.UInt32, side) for side in size)
         index = dr.arange(mi.UInt32, size[0] * size[1])
+        # The width of a pixel at distance 1; then x to the right and y down from the middle there.
         pixel = dr.opaque(mi.Float, eye.pixel)
         x = (mi.Float(index % columns) + 0.5 - 0.5 * mi.Float(columns)) * pixel
         y = (mi.Float(index // columns) + 0.5 - 0.5 * mi.Float(rows)) * pixel

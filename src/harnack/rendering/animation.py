@@ -261,16 +261,16 @@ def _cameras(
         points = np.array(np.meshgrid(*corners.T)).reshape(3, -1).T
     box, center = Box(*map(_as_point, corners)), _as_point(corners.mean(axis=0))
     framed = [
-        _orbited(replace(camera, box=box, target=camera.target or center), orbit * s, turn)
-        for camera, s, turn in zip(cameras, steps.tolist(), rotations, strict=True)
+        _orbited(replace(camera, box=box, target=camera.target or center), orbit * s, rotation)
+        for camera, s, rotation in zip(cameras, steps.tolist(), rotations, strict=True)
     ]
     # Frame each camera by itself, with zoom 1. For that, points are only rotated until `up` is z.
     chooses_distance = [camera.position is None and camera.distance is None for camera in framed]
     poses = [
         replace(camera, zoom=1.0).pose(
-            points @ turn.T, size, lambda local, turn=turn: local @ turn.T
+            points @ rotation.T, size, lambda local, rotation=rotation: local @ rotation.T
         )
-        for camera, turn in zip(framed, rotations, strict=True)
+        for camera, rotation in zip(framed, rotations, strict=True)
     ]
     distances = [float(np.linalg.norm(pose.origin - pose.target)) for pose in poses]
     # A default of 1 is never used: it is for films in which no camera needs the number.
@@ -417,7 +417,8 @@ def _mp4(path: Path, size: tuple[int, int], fps: float) -> Generator[Callable[[P
             """
             if pixels.shape[-1] == 4:
                 raise ValueError("films in .mp4 have no alpha: choose another backdrop, or a .gif")
-            # `stream` is the video in the file `container`.
+            # `stream` is the video in the file `container`. Its format needs even sides, so an odd
+            # last row or column is cut off.
             height, width = (side - side % 2 for side in pixels.shape[:2])
             # The size is set by the first picture, which a color bar may have widened.
             if not stream.codec_context.is_open:

@@ -149,7 +149,7 @@ class AovTask:
         """
         executor = Executor(self) if executor is None else executor
         width, height = self.size
-        order = self.order
+        order = self.order  # the numbers of the pixels, in the order in which they are traced
         ranges, buffers = executor.split_range(width * height, _RAYS_A_BAND), list[AovBuffers]()
         for (start, stop), buffer in zip(
             ranges, executor.run_tasks("render_range", ranges), strict=True

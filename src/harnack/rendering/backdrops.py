@@ -60,6 +60,7 @@ def distant_ground_radiance(backdrop: str, azimuth: float) -> FloatArray:
     upper hemisphere, weighted by the cosine to the vertical.
     """
     image = environment(azimuth)
+    # The z of the directions of each row, from 1 (straight up) to -1.
     z = np.cos(math.pi * (np.arange(len(image)) + 0.5) / len(image))
     # The weight of a row: the cosine to the vertical, times the row's solid angle.
     weight = np.clip(z, 0, None) * np.sqrt(1 - z * z)
@@ -130,8 +131,9 @@ def environment(azimuth: float) -> Any:
     # With a power below 1, the color changes fastest just above the horizon.
     height_fraction = np.clip(z, 0, 1)[..., None] ** 0.7
     image = _HORIZON + (_ZENITH - _HORIZON) * height_fraction
+    # The middle of the strip is 125 degrees from the camera's azimuth, 28 above the horizon; its
+    # light falls off with the angle to this direction, to 1/e at 31 degrees.
     strip_direction = _direction(azimuth + 125, 28)
-    # The strip's light falls off with the angle to its middle.
     image += _STRIP * np.exp((direction @ strip_direction - 1) / 0.14)[..., None]
     return image.astype(np.float32)
 

@@ -261,6 +261,7 @@ def _probe(
     # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
     rough_surface = replace(surface, tolerance=HitTolerance(1e-3 * size))
     placed = PlacedSurface.of(rough_surface, Placement.identity(), backend)
+    # Rays begin and end a hundredth of the size off the box; all of them are traced (`True`).
     o, d, length = _rays(lower, upper, 0.01 * size, grid)
     hits = placed.intersect(
         to_vector3(backend, o),

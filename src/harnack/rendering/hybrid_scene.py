@@ -249,6 +249,7 @@ class HybridScene:
         def to_neighbor(o: Any, along: Any) -> Any:
             """Return the vector from the hit to the point at which the ray of a neighboring pixel
             meets the tangent plane. o, along: (3,) the origin and the direction of this ray."""
+            # How far the neighbor's ray is from this one, after the length t.
             offset = o + t * along - ray.o - t * ray.d
             return offset - d * (dr.dot(offset, normal) / normal_dot_d)
 

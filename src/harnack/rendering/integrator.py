@@ -318,6 +318,7 @@ class PathTracer:
         """
         mi, world = self.mi, HybridScene.of(self.mi, scene, queued=True)
         width = dr.width(sampler.index)
+        # At first no path has brought light, hit anything or been lost.
         results = PathResults(
             dr.zeros(mi.Spectrum, width), dr.zeros(mi.Bool, width), dr.zeros(mi.Bool, width)
         )

@@ -180,6 +180,8 @@ class Isolines:
         width = _DEFAULT_WIDTH * size if self.width is None else self.width
         step, period = self._exact_interval(), self.function_field.period
         volume = padded_domain(self.function_field, size)
+        # g, its volume, half the width of a line, the interval or else the table of levels, and the
+        # period of g; what does not exist is None.
         return PreparedIsolines(
             self.function_field.prepare(backend),
             None if volume is None else volume.prepare(backend),

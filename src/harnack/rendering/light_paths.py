@@ -262,6 +262,7 @@ class TimeEstimate:
         hours, rest_of_hour = divmod(minutes, 60)
         if seconds < 90:
             return f"{seconds} s"
+        # Seconds behind minutes are rounded down to tens.
         if minutes < 90:
             return f"{minutes} min {rest // 10 * 10} s" if minutes < 10 else f"{minutes} min"
         return f"{hours} h {rest_of_hour} min"
@@ -457,6 +458,7 @@ class RefractionTracer:
             & first.is_hit
             & (interface_count <= _MAX_INTERFACES)
         )
+        # The refractive index; 1, which is not used, for what is no transparent solid.
         index = mi.Float(1)
         for proxy, value in self.indices:
             index = dr.select(si.shape == mi.ShapePtr(proxy), value, index)

@@ -196,7 +196,8 @@ def _scene_text(path: Path) -> str:
 def _files_named(text: str) -> list[tuple[str, str]]:
     """Find the files that the text of a scene may name. Returns pairs (element, name), such as
     ("include", "lights.xml")."""
-    # Groups 2 and 3 are the value in double and in single quotes; one of them is None.
+    # An element has its name as group 1 and its attributes as group 2. Groups 2 and 3 of an
+    # attribute are the value in double and in single quotes; one of them is None.
     return [
         (element[1], attribute[2] or attribute[3])
         for element in _NAMES_A_FILE.finditer(text)

@@ -218,6 +218,7 @@ def _carrier_class(variant: str) -> Any:
             self, props: Any, surface: TracedSurface, placement: Placement, tint: Any,
             cut_bsdf: Any, isolines: Sequence[Isolines],
         ) -> None:  # fmt: skip
+            # The lower and the upper corner of its box.
             ends = bounding_box(surface)
             # With two vertices and two faces.
             mi.Mesh.__init__(self, PLUGIN, 2, 2, props=props)

@@ -144,7 +144,8 @@ def check_color_bar(color_bar: Any, show: str) -> bool | str:
     if isinstance(color_bar, str):
         if not color_bar.isprintable():
             raise ValueError(f"the title of a color bar is one line of letters, not {color_bar!r}")
-        typeface_for(color_bar, 10)  # raises the error of letters that cannot be written
+        # Raises the error of letters that cannot be written, whatever their size (here 10 pixels).
+        typeface_for(color_bar, 10)
     return color_bar
 
 

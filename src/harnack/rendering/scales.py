@@ -389,6 +389,7 @@ def add_color_bar(pixels: Pixels, scale: ColorScale, background: Color) -> Pixel
 
     An end of the bar is pointed if the picture has numbers beyond it (`ColorScale.exceeded`).
     """
+    # The background is light if its channels have a mean above 1/2.
     background_bytes = tuple(round(255 * fraction) for fraction in background)
     ink_color = _ON_LIGHT if sum(background) > 1.5 else _ON_DARK
     images, drawings, _ = require_pillow()

@@ -79,9 +79,8 @@ class ConeCoverage:
         t = dr.select(dr.isfinite(distance), distance, dr.largest(mi.Float))
         # The vectors to the neighboring pixels span one pixel at distance 1.
         to_right, to_below = ray.d_x - ray.d, ray.d_y - ray.d
-        radius = 0.5 * dr.maximum(
-            dr.norm(to_right + to_below), dr.norm(to_right - to_below)
-        )  # half the longer diagonal
+        # Half the longer diagonal.
+        radius = 0.5 * dr.maximum(dr.norm(to_right + to_below), dr.norm(to_right - to_below))
         is_covered = dr.zeros(mi.Bool, dr.width(ray.d))
         for placed, balls in self.placed:
             is_covered |= placed.covers_in_part(ray.o, ray.d, radius, t, balls)
@@ -181,6 +180,7 @@ def ambient_visibility(
         offset = dr.gather(mi.Vector3f, position, pixel, is_in_picture) - position
         point_distance = dr.norm(offset)
         fade = dr.maximum(1 - dr.square(point_distance / reach_in_space), 0)
+        # Lower elevations may be due to facets and rounding: they count as 0.
         sine = dr.dot(offset, normal) / point_distance - LEAST_SINE
         # The sine is NaN if nothing is seen, and then not larger than 0.
         return dr.select(is_in_picture & (sine > 0), sine * fade, 0)
@@ -320,7 +320,7 @@ class ShadedTask:
         self.refines = spp > 1
         matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         self.light = StudioLight.of(matrix)
-        self.evaluate_with = RefractionTracer(world, self.light, hides_lights=cut_out)
+        self.refraction = RefractionTracer(world, self.light, hides_lights=cut_out)
         self.floor = FloorShadow.of(world, self.light) if on_floor else None
 
     def render_gbuffer(self, start: int, stop: int) -> GBuffer:
@@ -349,7 +349,7 @@ class ShadedTask:
         mi, scene = self.mi, self.world.scene
         ray, weight = self.ray(pixel, offset)
         # The first opaque hits, behind transparent solids (`RefractedHits`).
-        hits = self.evaluate_with.trace(mi.Ray3f(ray))
+        hits = self.refraction.trace(mi.Ray3f(ray))
         si, first = hits.si, hits.first
         # Adding zeros gives the mask its full width.
         lost = first.is_out_of_steps | dr.zeros(mi.Bool, dr.width(pixel))
@@ -369,7 +369,8 @@ class ShadedTask:
             mi, hits.throughput * emitted + weight * hits.reflected_light, ray.wavelengths
         )
         light = dr.select(lost, mi.Color3f(OUT_OF_STEPS_COLOR), light)
-        covered = hit | lost | (hits.interface_count > 1)  # transparent solids cover, too
+        # Transparent solids cover, too: a ray that was traced more than once has met one.
+        covered = hit | lost | (hits.interface_count > 1)
         if self.cut_out:
             light = dr.select(covered, light, 0)
         transmittance = as_rgb(mi, hits.throughput, ray.wavelengths)

@@ -217,9 +217,8 @@ def reflectance(color: Any, painted: Any) -> Any:
     """
     painted_color = color
     largest_channel = dr.max(color)
-    metal = (
-        dr.square(color / largest_channel) * _METAL
-    )  # light in a mirror is reflected more than once
+    # The square, as light in a mirror is reflected more than once.
+    metal = dr.square(color / largest_channel) * _METAL
     color = dr.select(largest_channel > 1, metal, color)
     return dr.select(
         painted, painted_color, dr.select(largest_channel > 0, color, _like(color, _CLEAR))
@@ -316,6 +315,7 @@ class FloorShadow:
         fractions = _visible_fractions(
             world, x, y, np.stack([_key_directions(light.key), sky_directions()])
         )
+        # The channels of the texture are the fractions of the key light and of the sky.
         image = np.stack([_blurred(fraction) for fraction in fractions], axis=-1)
         numbers = mi.Float(upload_floats(mitsuba_backend(mi), image.ravel()))
         tensor = mi.TensorXf(numbers, image.shape)
@@ -389,6 +389,7 @@ def _key_directions(key: Any) -> FloatArray:
     tangent /= np.linalg.norm(tangent)
     radius, angle = np.split(key_light_points(), 2, axis=-1)
     d = axis + radius * (np.cos(angle) * tangent + np.sin(angle) * np.cross(axis, tangent))
+    # Rays go up from the floor, which casts no shadow itself.
     d[..., 2] = np.maximum(d[..., 2], LEAST_KEY_HEIGHT)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
@@ -398,9 +399,9 @@ def sky_directions() -> FloatArray:
     of their angle to the vertical."""
     # Uniform squares of the sine give the cosine distribution. The height is kept above 0, so that
     # no ray runs along the floor.
-    sine_squared, angle = np.moveaxis(_square(), -1, 0)
+    sine_squared, turn = np.moveaxis(_square(), -1, 0)
     sine = np.sqrt(sine_squared)
-    return np.stack([sine * np.cos(2 * math.pi * angle), sine * np.sin(2 * math.pi * angle),
+    return np.stack([sine * np.cos(2 * math.pi * turn), sine * np.sin(2 * math.pi * turn),
                      np.sqrt(np.maximum(1 - sine_squared, 1e-3))], axis=-1)  # fmt: skip
 
 

@@ -286,7 +286,8 @@ def build_studio(
         points = corners_of(np.array(camera.box.bounds()))
     placement = stage_placement(points, rotation_to_z_up(up))
     pose = camera.pose(placement.apply(points), size, placement.apply)
-    # The path tracer of this library, which sees level sets, draws the scene.
+    # The path tracer of this library, which sees level sets, draws the scene. It limits the light
+    # of a path ("clamp"), and the camera does not see the lights themselves.
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {

@@ -212,7 +212,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 
     def sample_all(_: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return value, error bound, gradient and shading normal at all points p. The argument, the
-        state before, is not used."""
+        state before, is not used: it has the same four numbers."""
         sample = prepared.sample_with_branch(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)

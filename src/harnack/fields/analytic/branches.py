@@ -381,7 +381,7 @@ class PowerProduct(Branches):
         for i, (a, alpha) in enumerate(zip(self.centers, self.exponents, strict=True)):
             if alpha > 0 and alpha.is_integer():
                 continue
-            if alpha < 0:
+            if alpha < 0:  # g is infinite there, so no bound is stated
                 points.append(BranchPoint(a))
                 continue
             other_factors = [

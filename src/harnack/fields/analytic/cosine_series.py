@@ -232,6 +232,7 @@ def _spectral_norms(
     computed by Smith's formula (1961).
     """
     norms = np.empty(tuple(len(values) for values in nodes))
+    # At most about 400,000 nodes at a time.
     slab_size = max(1, 400_000 // (norms.shape[1] * norms.shape[2]))
     for start in range(0, len(nodes[0]), slab_size):
         slab_nodes = nodes[0][start : start + slab_size], nodes[1], nodes[2]

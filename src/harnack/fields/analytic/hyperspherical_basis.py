@@ -61,6 +61,7 @@ def gegenbauer(n: int, k: int, w: Any) -> Any:
     by its recurrence in n."""
     if n < 0:
         return 0.0 * w
+    # C_-1 = 0 and C_0 = 1; then C_i = a w C_(i-1) - b C_(i-2).
     previous, value = 0.0 * w, 0.0 * w + 1.0
     for degree in range(1, n + 1):
         a, b = _coefficients(degree, k)

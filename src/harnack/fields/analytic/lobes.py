@@ -334,6 +334,7 @@ class Lobes(Field):
         else:
             low, high = (low, high) if self.part == "positive" else (-high, -low)
             degree, power = self.degree, 6 * farthest
+        # The proof has a bound of its own for degree 1.
         tangential_bound = 0.5 * (high - low) * (degree**2 if degree != 1 else 2 / math.sqrt(3))
         lower, upper = -(2 * high + tangential_bound), power - (2 * low - tangential_bound)
         margin = _ROUNDING * (abs(lower) + dr.abs(upper))

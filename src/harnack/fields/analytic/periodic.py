@@ -113,14 +113,14 @@ class ExtensionBounds:
         wavenumbers, amplitudes = np.array(waves.wavenumbers), np.array(waves.amplitudes)
         # The mean square of |grad f| is half the sum of A_i^2 kappa_i^2.
         mean_slope = math.sqrt(0.5 * float(amplitudes**2 @ wavenumbers**2))
+        # One over the root mean square of the wavenumbers, weighted by A_i^2.
         length_unit = 1 / math.sqrt(
             float(amplitudes**2 @ wavenumbers**2) / float(amplitudes @ amplitudes)
         )
         # Radii from 0.02 to about 7 length units.
-        steps = (length_unit * 0.02 * 1.02**n for n in range(300))
-        radii = [
-            r for r in steps if r * float(wavenumbers.max()) < 30.0
-        ]  # cosh stays far from overflow
+        candidates = (length_unit * 0.02 * 1.02**n for n in range(300))
+        # So that cosh stays far from overflow.
+        radii = [r for r in candidates if r * float(wavenumbers.max()) < 30.0]
         trials = [cls.at(waves, r) for r in radii]
         return min(trials, key=lambda trial: trial._descent_at_zero(mean_slope) / trial.radius**2)
 
@@ -231,9 +231,12 @@ class EigenfunctionSum(Field):
         E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
     so the larger constant and E^2/(2 h H), added to the value's error, cover the error of Taylor's
-    formula with a rounded gradient. For the harmonic ball of radius R this error is E R. The slope
-    enters there in units of 4 (f - lower)/R, where f - lower is about H R^2/2 or more, and
-    `enclosures.free_radius.condition_rounding` covers 16 u of this unit. Only the rest is added.
+    formula with a rounded gradient. For the harmonic ball of radius R the effect of E is at most
+    E R. The proofs on balls allow for a part of it themselves: they use the slope in units of
+    4 (f - lower)/R, where `lower` is the lower bound on the ball, with an error of 16 u of this
+    unit (`enclosures.free_radius.condition_rounding`; u is the unit roundoff). As f - lower is
+    about H R^2/2 or more, that part is about 32 u H R^2; half of it is left as a margin. Only the
+    rest of E R is added.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.

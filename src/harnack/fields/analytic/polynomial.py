@@ -327,7 +327,8 @@ class _SolidHarmonics(Field):
         if lipschitz is not None:
             alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
         error = self._promises.error(rho, r, curvatures[0])
-        # The gradient with its components in the order of the coordinates of p.
+        # The gradient with its components in the order of the coordinates of p, which `_local`
+        # rotates by axis + 1 positions.
         gradient_at_p = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
         return Sample(
             value, gradient_at_p, promises, error, alternative_promises=tuple(alternatives)

@@ -246,6 +246,7 @@ class RiemannSurface(Field):
         corners = [complex(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])]
         if not np.isfinite(corners).all():
             return math.inf
+        # The first and the last corner are opposite.
         middle = 0.5 * (corners[0] + corners[3])
         reach = max(abs(corner - middle) for corner in corners)
         return abs(self.height) * self.branches.max_abs(middle, reach)
@@ -597,6 +598,7 @@ class RiemannSurface(Field):
             y, norm = dr.abs(y), abs(offset)
             for m in (0.5 * y, dr.power(y / constant, 1 / power) - norm):
                 radius = dr.power(fmax(y - m, 0) / constant, 1 / power) - norm
+                # The bound at a holds up to the distance `point.radius` from a.
                 radius = fmin(fmin(radius, point.radius - norm), m)
                 proved = fmax(radius, proved)
         return proved

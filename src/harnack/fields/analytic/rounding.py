@@ -305,9 +305,8 @@ class WaveRounding:
             )
             angle_error, axis_errors, other_errors = _term_roundings(term, common_frequencies)
             _, all_axis_errors, _ = _term_roundings(term, (None, None, None))
-            partial_sums = (
-                (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
-            )  # the first sum is exact
+            # The first sum is exact.
+            partial_sums = (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
             # The added 2 and 6 are roundings of the factors that differentiation adds.
             value[0] += amplitude * (angle_error + other_errors) + partial_sums[0]
             gradient[0] += amplitude * norm * (angle_error + other_errors + 2) + partial_sums[1]

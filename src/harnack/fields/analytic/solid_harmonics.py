@@ -346,10 +346,8 @@ def from_monomials(coefficients: Monomials) -> dict[tuple[int, int], float]:
     legendre = Legendre(0.0, 1.0)
     weights: dict[tuple[int, int], float] = {}
     for l in range(max(sum(powers) for powers in coefficients) + 1):  # noqa: E741
-        circle_values = [
-            np.zeros(sample_count),
-            np.zeros(sample_count),
-        ]  # f_l and its z-derivative at z = 0
+        # The part f_l of degree l and its z-derivative, on the circle.
+        circle_values = [np.zeros(sample_count), np.zeros(sample_count)]
         largest_coefficient = 0.0
         for (i, j, k), coefficient in coefficients.items():
             if i + j + k == l:

@@ -117,6 +117,7 @@ class Blobs(Formula):
             centers, radii, weights, groups
         )
         self.kernel = choose_kernel(kernel)
+        # Set by `prepare`: the data on a backend.
         self._on: _BlobDeviceData | None = None
 
     def __len__(self) -> int:

@@ -2,9 +2,9 @@
 there. The surface is f = 0 for a sum f of one term for each point: f(x) = sum over i of a_i r_i^3 +
 b_i . grad r_i^3, with r_i = |x - p_i|, numbers a_i and vectors b_i. The record of a point is its
 row of numbers: p_i (entries 0 to 2), what rounding has cut off of p_i (3 to 5), a_i (6) and 3 b_i
-(7 to 9). Along a path p + s d, a straight line from a point p, each term
-is a function of the length s. A path is cut into pieces at knots, which are values of s. Jets are
-intervals that contain the values and the derivatives of a function."""
+(7 to 9). Along a path p + s d, a straight line from a point p, each term is a function of the
+length s. A path is cut into pieces at knots, which are values of s. Jets are intervals that contain
+the values and the derivatives of a function."""
 
 from __future__ import annotations
 
@@ -91,6 +91,7 @@ class HRBF(Formula):
         margin = _MARGIN * float((upper - lower).max())
         self.domain = Box(lower - margin, upper + margin) if domain is None else domain
         self.lipschitz = self._largest_gradient()
+        # Set by `prepare`: the backend, and the table of the points' records on it.
         self._on: tuple[Backend, RecordTable] | None = None
 
     @cached_prepare
@@ -429,6 +430,7 @@ def _term_functions(h_squared: Real, x: Real, tiny: float) -> _TermFunctions:
     r = dr.sqrt(r_squared)
     inverse_r = 1 / fmax(r, tiny)
     u = x * inverse_r
+    # In this order: r x, u, (h^2 + 2x^2)/r, h^2/r^3, 3u - u^3.
     return _TermFunctions(
         r * x,
         u,

@@ -462,7 +462,8 @@ class CubicKernel(BlobKernel):
             """The kernel at the distance r = sqrt(q) from the center."""
             return (1 - r) * (1 - r) * (1 + 2 * r)
 
-        # r has an absolute error of half an epsilon, and 1 - r of at most as much.
+        # dk/dq is -3 (1 - r), and d2k/dq2 is 1.5/r. r has an absolute error of half an epsilon, and
+        # 1 - r of at most as much.
         slope = Interval(-3 * (1 - low_r) - 8 * epsilon, fmin(-3 * (1 - high_r) + 8 * epsilon, 0))
         value = Interval(fmax(value_at(high_r) - 8 * epsilon, 0), value_at(low_r) + 8 * epsilon)
         second = Interval(1.5 / high_r, dr.select(low_r > 0, 1.5 / low_r, dr.inf)).widened(

@@ -158,6 +158,8 @@ class BooleanSolid(Solid):
 
     @property
     def variable_accuracy(self) -> VariableAccuracy | None:
+        """How f is sampled with different accuracy: all operands that can be sampled so have the
+        same accuracy scale (larger is more accurate). None if there is no such operand."""
         accuracies = [part.variable_accuracy for part in self.parts]
         known = [accuracy for accuracy in accuracies if accuracy is not None]
 
@@ -166,7 +168,7 @@ class BooleanSolid(Solid):
             pairs = zip(self.parts, accuracies, strict=True)
             return self._with_parts([part if a is None else a.at(scale) for part, a in pairs])
 
-        # `coarsest` is the accuracy scale of the coarsest samples that a field has.
+        # `coarsest` is the accuracy scale of the coarsest samples that an operand has.
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
 
     def for_ray_count(self, count: int) -> Field:
@@ -507,6 +509,7 @@ class OffsetSolid(SolidOfField):
     def _shifted(self, sample: Sample) -> Sample:
         """The sample of f - distance, from the sample of f at the same point. The bound of the
         error includes the rounding of the difference."""
+        # The terms of the difference: its error is a few roundings of their size.
         size = dr.abs(sample.value) + abs(self.distance)
         return sample.map_promises(
             lambda promise: promise.shifted(-self.distance),
@@ -564,6 +567,7 @@ class BlendedSolid(FormulaSolid):
             part.formula(*probe_jets())  # raises TypeError for a solid without a formula
         constants = [part.lipschitz for part in self.parts]
         all_known = all(part is not None for part in constants)
+        # The constant of the blend of two functions, with a margin for rounding.
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if all_known else None
         object.__setattr__(self, "lipschitz", lipschitz)
         object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))

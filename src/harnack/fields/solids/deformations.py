@@ -243,10 +243,11 @@ class Taper(Deformation):
         """The point that the taper takes to (x, y, z): its coordinates across the axis are divided
         by the factor r."""
         u, v, w = _axis_last((x, y, z), self.axis)
-        (a, r), (b, s) = self.start, self.end
+        # Positions along the axis, and the factors there.
+        (a, first), (b, last) = self.start, self.end
         # The position between start (0) and end (1); then 1/r there.
         fraction = minimum(maximum((w - a) * (1.0 / (b - a)), 0.0), 1.0)
-        inverse = 1.0 / (fraction * (s - r) + r)
+        inverse = 1.0 / (fraction * (last - first) + first)
         return _axis_in_place((u * inverse, v * inverse, w), self.axis)
 
     def volume(self, volume: Volume | None) -> Volume | None:
@@ -266,13 +267,14 @@ class Taper(Deformation):
         `total`). k and m bound 1/r and rho |r'|/r^2 on the ball, where r is the factor, r' its
         derivative along the axis and rho the distance from the axis (the class docstring has the
         proof)."""
-        (a, r), (b, s) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
+        # Positions along the axis, and the factors there, each with one lane for each ball.
+        (a, first), (b, last) = ((0 * p.x + u, 0 * p.x + v) for u, v in (self.start, self.end))
         axis_distance = _distance_from_axis(p, self.axis)
         # Any radius is valid; a larger one has a larger constant.
         radius = 0.25 * axis_distance + 0.25 * (b - a)
         # The largest k and m on the ball.
-        k = 1 / fmin(r, s)
-        m = (axis_distance + radius) * dr.abs(s - r) / (b - a) * k * k
+        k = 1 / fmin(first, last)
+        m = (axis_distance + radius) * dr.abs(last - first) / (b - a) * k * k
         total = k * k + m * m + 1
         root = dr.sqrt(fmax(total * total - 4 * k * k, 0))
         return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius

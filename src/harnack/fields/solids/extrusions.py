@@ -199,7 +199,7 @@ class Extrusion(Solid):
         gradient: (3,) the gradient of that distance as a function of p in space.
         promise: a Lipschitz constant of f near p; None for the constant 1 everywhere.
         """
-        epsilon = 2 * float(dr.epsilon(type(p.x)))
+        epsilon = 2 * float(dr.epsilon(type(p.x)))  # the machine epsilon
         half = cast("Any", self)._half
         end_distance = dr.abs(p.z - half) - half
         # f, and its derivatives by the two distances.
@@ -214,6 +214,7 @@ class Extrusion(Solid):
         gradient_error = gradient_error + dr.select(
             (side_weight > 0) & (end_weight > 0), fmin(2 * error / value, 2), 0
         )
+        # By default the constant 1, on each lane.
         promises = (Lipschitz(0 * p.x + 1) if promise is None else promise,)
         return Sample(value, gradient, promises, error, gradient_error)
 
@@ -315,6 +316,7 @@ class Extrusion(Solid):
         """A Lipschitz constant of the inverse of twist and taper (the map `_preimage`) on a ball
         about p, and the radius of that ball. The class docstring has the proof."""
         taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
+        # Without twist and taper: the constant 1 in all of space, on each lane.
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
             constant, radius = taper.preimage_lipschitz(p)
@@ -616,14 +618,14 @@ class SolidOfRevolution(Solid):
         outward: x and y of the unit vector from the axis to p.
         side: the sample of the distance from the outline.
         """
-        epsilon = 2 * float(dr.epsilon(type(p.x)))
+        epsilon = 2 * float(dr.epsilon(type(p.x)))  # the machine epsilon
         radial, up = side.gradient
         gradient = cast("Any", type(p))(radial * outward[0], radial * outward[1], up)
         error = side.error + 8 * epsilon * r
         return Sample(
             side.value,
             gradient,
-            (Lipschitz(0 * p.x + 1),),
+            (Lipschitz(0 * p.x + 1),),  # the constant 1, on each lane
             error,
             side.gradient_error + 8 * epsilon,
         )
@@ -653,7 +655,7 @@ class SolidOfRevolution(Solid):
         # The components of the ray's direction away from the axis and around it.
         rate, across = unit_x * d.x + unit_y * d.y, unit_x * d.y - unit_y * d.x
         side = outline.sample(r, p.z, (rate, d.z), knots)
-        epsilon = 2 * float(dr.epsilon(type(r)))
+        epsilon = 2 * float(dr.epsilon(type(r)))  # the machine epsilon
         lower_bounds = tuple(
             bound - _tangent_gap(r, rate, across, knot, epsilon)
             for bound, knot in zip(side.lower_bounds, knots, strict=True)
@@ -677,7 +679,8 @@ class SolidOfRevolution(Solid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not is_jet(x, type(self).__name__):
             return self.differentiable_value(_vector(x, y, z))
-        return outline_distance_jet(_prepared_for(self, x.width)._outline.nearest, norm(x, y), z)
+        solid = _prepared_for(self, x.piece_length)
+        return outline_distance_jet(solid._outline.sample, norm(x, y), z)
 
 
 def _from_axis(p: Vec3) -> tuple[Real, tuple[Real, Real]]:

@@ -337,7 +337,7 @@ class FractalNoise(FormulaSolid):
         center = [0 * like + start.value_on_backend(like).midpoint for start in starts]
         radii = [0 * like + start.value_on_backend(like).radius for start in starts]
         data, constants = self._data(center[0]), CONSTANTS[self.fade]
-        epsilon = 2 * float(dr.epsilon(cast("Any", type(center[0]))))
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(center[0]))))  # the machine epsilon
         scale, amplitude = data["frequency"], data["amplitude"]
         total: Jet | None = None
         for value, gradient, hessian in self._octaves(center, each=True):

@@ -285,7 +285,7 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
 
     # The error of the value includes the change of f within `offset` of q.
     slope = safe_norm(sample.gradient) + sample.gradient_error
-    epsilon = 2 * float(dr.epsilon(type(q.x)))
+    epsilon = 2 * float(dr.epsilon(type(q.x)))  # the machine epsilon
     error = sample.value_error + 8 * epsilon * dr.abs(sample.value)
     error = (error + offset * (slope + dr.select(offset <= radius, bound, dr.inf) * offset)) * (
         1 + 1e-5
@@ -493,7 +493,7 @@ class BandSolid(SolidOfField):
         offset = self._level_difference(sample.value)
         negated = negated_sample(sample)
         is_below = offset < 0
-        epsilon = 2 * float(dr.epsilon(type(offset)))
+        epsilon = 2 * float(dr.epsilon(type(offset)))  # the machine epsilon
         # The rounding of the two differences.
         rounding = 8 * epsilon * (dr.abs(sample.value) + abs(self.level) + self.half_width)
         lipschitz = lipschitz_of(sample)

@@ -192,7 +192,7 @@ class Julia(Solid):
         real = cast("Any", type(p.x))
         is_single = dr.type_v(real) == dr.VarType.Float32
         escape = _ESCAPED_NORM["single" if is_single else "double"]
-        epsilon = 2 * float(dr.epsilon(real))
+        epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
         jac = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]

@@ -124,7 +124,7 @@ class OutlineEdges:
         # Rounding may have made an edge a point.
         keep = square > 0
         start, end, square, loop = (start[keep], end[keep], square[keep], loop[keep])
-        # The records.
+        # The records: (ax, ay, bx, by, 1/length^2) for the edge from a to b.
         rows = np.column_stack([start, end, 1.0 / square])
         chains = None
         if len(rows) >= _MIN_EDGES_FOR_CHAINS:
@@ -136,6 +136,8 @@ class OutlineEdges:
     def knots(self, x: Real, y: Real, ahead: Real) -> tuple[Real, ...]:
         """The knots: positions on lines from points (x, y) at which the distance is bounded. They
         increase; the last is the requested length `ahead`, which may be infinite."""
+        # If `ahead` is infinite, the inner knots are fractions of this length: a multiple of the
+        # coordinates and of the outline's size.
         max_length = _ENDLESS_LENGTH * (
             fmax(dr.abs(x), dr.abs(y)) + self.size + dr.abs(self.center[0])
         )
@@ -159,7 +161,7 @@ class OutlineEdges:
         convex function along a line, and lies above its tangent (`TangentEnclosure`).
         """
         real = cast("Any", type(x))
-        epsilon = 2 * float(dr.epsilon(real))
+        epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         x, y = x - self.center[0], y - self.center[1]
         size = dr.abs(x) + dr.abs(y)
         query = _OutlineQuery(

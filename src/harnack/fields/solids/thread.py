@@ -121,6 +121,7 @@ class Thread(Solid):
         # radian, so that u = z - _lead * angle.
         lead = self.starts * self.pitch * (-1 if self.left_handed else 1)
         set_frozen(self, "_lead", lead / (2 * math.pi))
+        # f is never less than -min_radius/2; near the axis it is this number.
         min_radius = min(b for _, b in rows)
         set_frozen(self, "_least", 0.5 * min_radius)
         max_radius = max(b for _, b in rows)
@@ -155,7 +156,7 @@ class Thread(Solid):
         the period from 0 to the pitch. In the core, the points near the axis where f is at its
         lower limit, f is constant, and its gradient is 0."""
         real, data = cast("Any", type(p.x)), cast("Any", self)
-        epsilon = 2 * float(dr.epsilon(real))
+        epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
         # u, and then u in the period from 0 to the pitch.
         axial = p.z - dr.atan2(p.y, p.x) * data._lead
@@ -238,7 +239,7 @@ class Thread(Solid):
         """
         zero = 0 * r
         nearest, d_r, d_z, gradient_error = zero + dr.inf, zero, zero, zero
-        epsilon = 2 * float(dr.epsilon(cast("Any", type(r))))
+        epsilon = 2 * float(dr.epsilon(cast("Any", type(r))))  # the machine epsilon
         for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
             edge_z, edge_r = zero + (end_z - start_z), zero + (end_r - start_r)
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)

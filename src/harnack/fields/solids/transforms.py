@@ -357,7 +357,7 @@ class TransformedSolid(SolidOfField):
             rounding error.
         """
         numbers = self.numbers
-        epsilon = 2 * float(dr.epsilon(type(sample.value)))
+        epsilon = 2 * float(dr.epsilon(type(sample.value)))  # the machine epsilon
         # The change of the inner function by the rounding of the preimage.
         rounding = 8 * epsilon * term_bound * safe_norm(sample.gradient)
         factor, stretch = numbers.factor, numbers.stretch
@@ -408,6 +408,7 @@ class _InverseMap:
         inverse = change.inverse
         # The first singular value is the largest.
         stretch = float(np.linalg.svd(inverse, compute_uv=False)[0]) * (1 + 1e-6)
+        # The last number, the largest component of the translation, is for the rounding.
         return cls(
             tuple(tuple(float(number) for number in row) for row in inverse),
             change.translation_vector,

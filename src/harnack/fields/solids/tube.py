@@ -300,7 +300,7 @@ class Tube(Solid):
         if not hasattr(self, "_records"):
             return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
         real, vector = cast("Any", type(p.x)), cast("Any", type(p))
-        epsilon = 2 * float(dr.epsilon(real))
+        epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         records: RecordTable = cast("Any", self)._records
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -409,7 +409,7 @@ def _add_segments_by_groups(
     well, and so lies above its own tangent.
     """
     real, vector = cast("Any", type(p.x)), cast("Any", type(p))
-    epsilon = 2 * float(dr.epsilon(real))
+    epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
 
     def add_ball_end(ball: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Update the state of a loop over balls: the smallest |p - c| + r so far, in a tuple of one
