@@ -164,10 +164,11 @@ def _sqrt(x: Interval) -> DerivativeRanges:
     root = _increasing_range(dr.sqrt, Interval(low, high))
     # A lower end that rounding took below 0 counts as 0. If x has no number >= 0, there is no root.
     is_none = x.upper < 0
-    number = root.lower
+    # (The last argument of `typed_select` tells the type of the numbers only.)
+    like = root.lower
     root = Interval(
-        typed_select(is_none, dr.nan, fmax(root.lower, 0), number),
-        typed_select(is_none, dr.nan, root.upper, number),
+        typed_select(is_none, dr.nan, fmax(root.lower, 0), like),
+        typed_select(is_none, dr.nan, root.upper, like),
     )
     # 1/(2 sqrt x) and -1/(4 x sqrt x)
     slope = _half(_positive_reciprocal(root))

@@ -148,7 +148,8 @@ def check_length_range(box: tuple[Any, Any], precision: Precision, subject: str)
 
 def check_largest_coordinate(size: float, precision: Precision, subject: str) -> None:
     """Raise ValueError if the largest absolute coordinate `size` of objects is too large for a
-    precision (see `LENGTH_RANGE`). subject: as in `check_length_range`."""
+    precision (see `LENGTH_RANGE`). subject: the beginning of the message, with its verb, such as
+    "origins have"."""
     largest = LENGTH_RANGE[precision][1]
     if size > largest:
         raise ValueError(

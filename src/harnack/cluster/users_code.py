@@ -9,7 +9,8 @@ in its present state: a worker may lack the module, or may have imported it befo
 and a checkpoint folder must distinguish two states of it. But the whole module would be too much,
 since modules also hold locks, clients and pictures. So an attribute is sent only if its name occurs
 in the code that is sent. A sent module raises an error when any other attribute is used, so that
-nothing is missing silently.
+nothing is missing silently. (One exception: the dictionary that `globals()` returns in a function
+lacks what was not sent.)
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from typing import Any, cast
 
 # Suffixes of modules that can be sent; other modules are compiled, and are files to be compared.
 _SOURCES = (*importlib.machinery.SOURCE_SUFFIXES, *importlib.machinery.BYTECODE_SUFFIXES)
-# Functions that read all attributes of a module at once.
+# Names by which code can read all attributes of a module at once.
 _ALL_ATTRIBUTES = frozenset(("vars", "dir", "__dict__", "getmembers"))
 # Functions that import modules without an import statement.
 _IMPORTERS = frozenset(("import_module", "__import__"))
 # Attributes of its module that a function may use without naming them.
 _ALWAYS_SENT = ("__package__", "__name__", "__path__", "__file__")
-# Attributes that belong to the process that imported a module.
+# Attributes that Python's import sets, and that mean nothing in another process.
 _NEVER_SENT = frozenset(("__builtins__", "__spec__", "__loader__", "__cached__"))
 # The attribute of a sent module that lists the names of the attributes that were not sent.
 _LEFT_OUT = "__left_out__"
@@ -106,9 +107,14 @@ def function_in(module: SentModule, code: CodeType, closure: Any) -> FunctionTyp
 
 
 def attributes_named(module: ModuleType, words: frozenset[str] | set[str]) -> dict[str, Any]:
-    """Return the attributes of a module that code may use, by name, in alphabetical order: those
-    whose names are among `words`, or all of them if `words` contains a function such as `vars`.
-    Attributes that belong to a process are left out. words: identifiers and strings in the code."""
+    """Return the attributes of a module that code may use, by name, in alphabetical order.
+
+    These are the attributes whose names are among `words`, and `__getattr__`; or all attributes, if
+    `words` contains a name such as "vars", by which code can read attributes without naming them.
+    Attributes that Python's import sets, such as `__spec__`, are left out.
+
+    words: the identifiers and strings in the code.
+    """
     uses_all = bool(words & _ALL_ATTRIBUTES)
     return {
         name: value

@@ -362,7 +362,9 @@ class _QueryEvaluator:
         domain = field.domain and field.domain.prepare(backend)
         assign(self, "_domain", domain)
         assign(self, "_clip", domain and ClipCurveDescent(backend, field, self.levels, domain))
-        # Rays are compared by differences of angles, for which single precision is too coarse.
+        # For a function with jumps, closest points are searched by rays from the query
+        # (`compass_search`), in directions that differ less and less. Single precision is too
+        # coarse for such small angles.
         double = choose_backend("double")
         assign(self, "_tracer", self.surface.prepare(double) if field.jumps is not None else None)
 

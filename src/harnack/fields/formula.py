@@ -124,11 +124,14 @@ class Formula(Field):
         """Whether f may change within the rounding of coordinates by far more than its slopes
         allow, as a steep step between two flat parts does.
 
-        `Tally.turns_within` estimates this from the numbers in the formula: how steep f may be, and
-        how small the smallest number is. f may bend sharply where it changes by no more than the
-        smallest number. If a Lipschitz constant is stated, values of f are about as large as
-        distances, as for the library's shapes. Then small numbers in the formula are mere lengths,
-        and 1 is taken in place of the smallest number, so that only large numbers make f abrupt.
+        `Tally.turns_within` estimates this from the constants in the formula. A part of the formula
+        such as max(y, 0.01) can turn from flat to steep and to flat again while it changes by as
+        little as its constant. So f counts as abrupt if, within some roundings of the coordinates,
+        its steepest part may change by as much as the smallest constant (`tally.finest`).
+
+        If a Lipschitz constant is stated, values of f are about as large as distances, as for the
+        library's shapes. Then small constants are mere lengths, and 1 is taken in place of the
+        smallest one, so that only large constants make f abrupt.
         """
         # self.lipschitz: the stated Lipschitz constant of f, or None.
         return self.tally.turns_within(1.0 if self.lipschitz is not None else self.tally.finest)

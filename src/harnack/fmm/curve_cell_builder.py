@@ -449,11 +449,13 @@ def _rounding_factor(
     centers: (n, 3) the centers of the cells.
     radius: the radius of their balls.
 
-    Proof. `edges.vertex_rounding` assumes edges of half length h <= 1, and vertices at most 1 + |x|
-    from x. It is linear in h and in that distance. The apexes are the only vertices that may be
-    outside of the unit ball. So a factor that is at least 1, at least h, and at least the distance
-    from x to any apex, covers the loops that contain an apex. (The factors 0.51 = 1.02/2 and 1.01
-    leave a little for rounding.)
+    Proof. Let h be the largest half length of an edge, and R the largest distance of a vertex from
+    x. By `LoopEdges.rounding` the error is at most epsilon (2.9 h + 2.25 R) times the integral of
+    |dp|/D^2, a sum without products of h and R. `edges.vertex_rounding` puts 1 for h and 1 + |x|
+    for R, which is right for edges of the curve, as it lies in the unit ball. Apexes may lie
+    outside: then h may exceed 1, and R may exceed 1 + |x|. A factor F that is at least 1, at least
+    h, and at least the distance from x to any apex, is enough: 2.9 F >= 2.9 h, and
+    2.25 (1 + |x|) F >= 2.25 R. (The factors 0.51 = 1.02/2 and 1.01 leave a little for rounding.)
     """
     # Each cell's factor is the largest over its runs: of the half lengths of their closing edges,
     # and of the distances of their apexes from the points of the ball.

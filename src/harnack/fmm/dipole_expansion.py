@@ -113,13 +113,15 @@ def _columns(level: NodeMoments, keys: Iterable[tuple[int, int, int]]) -> list[F
 def triangle_sources(corners: FloatArray) -> FloatArray:
     """Make the records (n, 30) of triangles (n, 3, 3), with the data that expansions need.
 
-    A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius; then the
-    radius, the bounds E and G of the terms beyond degree 4 (`multipole.truncation_bounds`), bounds
-    of the terms of degrees 1, 3 and 4 (`multipole.sup_norm`), and the moments of degrees 3 and 4.
+    A record holds: centroid, area times normal, area, `TRIANGLE_RATIO` times the radius of the
+    triangle; then this radius, the bounds E of the value and G of the gradient of all terms beyond
+    degree 4 (`multipole.truncation_bounds`), bounds of the terms of degrees 1, 3 and 4
+    (`multipole.sup_norm`), and the moments of degrees 3 and 4.
 
     The moment of degree 2 about the centroid is a mean of offsets from the centroid, and so is 0. A
-    triangle whose area is rounded to 0 gets an area of 1e-30, because a record without an area
-    means an empty slot, but the edges of this triangle count.
+    triangle whose area is rounded to 0 gets an area of 1e-30, because records without an area are
+    skipped as empty slots. This triangle must not be skipped: near triangles are summed by their
+    edges, which cancel where triangles meet, and its edges cancel those of its neighbors.
     """
     # A tree in which each leaf is one triangle, to compute its moments.
     leaves = BalancedTree(np.arange(len(corners), dtype=np.int64)[:, None], ())

@@ -304,7 +304,7 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
     index = np.empty((len(points), count), np.int32)
 
     def find_slice(rows: slice) -> None:
-        """Find the neighbors of the points `rows`."""
+        """Store the indices of the neighbors in `index`, for the rows of `points` in a slice."""
         index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
     parallel_over_slices(find_slice, len(points))
@@ -337,7 +337,7 @@ def _move_along_normals(
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
-        """Move the points `rows`."""
+        """Store the moved points in `moved`, for the rows of `start` in a slice."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         # n . (p_j - x), the height of each neighbor above the point.
@@ -369,8 +369,8 @@ def _agreeing_weight(
     similar to its own. Neighbors have weights that fall with the distance. A normal counts as
     similar by a number that is 1 for equal normals and falls with the angle between them.
 
-    start, own_normals: (m, 3) the points and their unit normals.
-    neighbors: (m, k) indices of their neighbors among `points`.
+    start, own_normals: (m, 3) the points whose fractions are computed, and their unit normals.
+    neighbors: (m, k) indices of their neighbors among `points`, the cloud.
     is_own: (m, k) whether a neighbor is the point itself, which does not count.
     points, normals: (n, 3) each, the points of the cloud and their unit normals.
     normal_scale: the length |n - n'| of the difference of two unit normals at which this number is
@@ -379,15 +379,19 @@ def _agreeing_weight(
     fraction = np.empty(len(start))
 
     def compute_slice(rows: slice) -> None:
-        """Compute the fractions for the points `rows`."""
+        """Store the results of `_agreeing_weight` in `fraction`, for the rows of `start` in a
+        slice."""
         n, index = own_normals[rows], neighbors[rows]
         offsets = points[index] - start[rows, None]
+        # n . (p_j - x), the height of each neighbor above the point's tangent plane.
         height = np.einsum("mi,mki->mk", n, offsets)
+        # The weight by distance alone; 0 for a neighbor that is the point itself.
         weight = (
             np.exp(-_DISTANCE_DECAY * _relative_to_largest(_squared_tangential(offsets, height)))
             * ~is_own[rows]
         )
         cosine = np.einsum("mi,mki->mk", n, normals[index])
+        # The part of this weight that is left if neighbors with other normals count less.
         fraction[rows] = (weight * _normal_weight(cosine, normal_scale)).sum(axis=1) / weight.sum(
             axis=1
         )
@@ -412,7 +416,7 @@ def _refit_normals(
     refitted = np.empty_like(normals)
 
     def refit_slice(rows: slice) -> None:
-        """Fit the normals of the points `rows`."""
+        """Store the fitted normals in `refitted`, for the rows of `points` in a slice."""
         index = neighbors[rows]
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])

@@ -600,11 +600,11 @@ def _kernel_data(
     # an entry is its path, such as "lane o 0" for the x of the origins.
     inputs = dict(labeled_leaves("lane", lanes))
     results = {name: kernel.results.get(f"result {name}") for name in _RESULTS}
-    # All results but the last, the color, must differ between rays.
+    # A result is None here if it is the same constant for all rays. Only the last, the color, may
+    # be: a surface with a single color has the index 0 everywhere.
     if any(results[name] is None for name in _RESULTS[:-1]):
         raise ValueError("what rays meet is the same for all of them: there is nothing to draw")
-    # Results that are the same constant for all rays are 0 here; of these only the color may be
-    # constant.
+    # So for a result that is None, the color, the words are 0.
     answers = [
         np.zeros(len(origins), np.uint32) if x is None else as_words(x) for x in results.values()
     ]

@@ -48,9 +48,8 @@ __all__ = [
 Walls = tuple[FloatArray, FloatArray] | None
 # A function from points (k, 3) to the mask (k,) of those that matter; None if all do.
 Where = Callable[[FloatArray], BoolArray] | None
-# At the ends of an edge that cuts off a crease, normals differ by more than the first number, an
-# angle; at a point between and at one of the ends by at least the second times the angle between
-# those at both ends.
+# At the two ends of an edge that cuts off a crease, normals differ by an angle a of more than the
+# first number; at a point between the ends and at one of the ends, by more than a times the second.
 _CREASE, _SHARE = math.radians(20), 0.75
 # A vertex within this distance, relative to the tolerance, counts as on the surface.
 _ON_SURFACE = 1e-5
@@ -224,13 +223,18 @@ def _project_to_creases(
 def cuts_off_crease(
     first: FloatArray, second: FloatArray, between: FloatArray, min_angle: float
 ) -> BoolArray:
-    """(k,) whether edges of a mesh cut off a crease of the surface. The normals at both ends differ
-    by more than `min_angle` (in radians), and those between the ends and at one of the ends by
-    nearly that angle. On a smooth surface the latter two differ by about half of it.
+    """Return the mask (k,) of the edges of a mesh that cut off a crease of the surface.
 
-    first, second: (k, 3) the normals of the surface at the ends of each edge.
-    between: (k, 3) those at a point of the surface between the ends.
+    An edge does if the normals at its two ends differ by an angle a > `min_angle` (in radians), and
+    the normal between them differs from one of the two by nearly a. Then the surface bends in one
+    place only, on one side of the point between. On a smooth surface the normal between differs
+    from each of the two by about a/2.
+
+    first, second: (k, 3) unit normals of the surface at the two ends of each edge.
+    between: (k, 3) unit normals at a point of the surface between the ends.
     """
+    # The larger of the two angles between the normal at the point between and those at the ends has
+    # the smaller cosine.
     angle_of_ends, angle_to_end = (
         np.arccos(np.clip(cosine, -1, 1))
         for cosine in (

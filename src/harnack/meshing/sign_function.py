@@ -231,7 +231,7 @@ class SignFunction(LevelFunction):
             # Halve the segments until few facets are left on them, and then intersect them with
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
-            t, normal, is_on_jump = self._on_sheets(low, direction, first, last)
+            t, normal, is_on_jump = self._jump_crossings(low, direction, first, last)
             # The shortened segments need two evaluations only.
             rows = np.flatnonzero(~is_on_jump)
             t[rows] = self._roots(low[rows], direction[rows], first[rows], last[rows], 2)
@@ -316,7 +316,7 @@ class SignFunction(LevelFunction):
                 break
         return _secant(first, last, low, high)
 
-    def _on_sheets(
+    def _jump_crossings(
         self, start: FloatArray, direction: FloatArray, first: FloatArray, last: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Where segments first cross a jump surface of the field, between the fractions `first` and

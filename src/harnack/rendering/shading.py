@@ -339,8 +339,8 @@ def _visible_fractions(
     point the fraction of its rays that hit nothing, (k, n, n).
 
     x, y: (n, n) coordinates of the points.
-    towards: (k, 16, rays, 3) unit directions. Each point of a block of 4 x 4 points takes one of
-        the 16 groups of rays.
+    towards: (k, 16, RAYS_PER_CELL, 3) unit directions of rays. Each point of a block of 4 x 4
+        points takes one of the 16 groups of a set.
     """
     mi = world.mi
     # The place of a point in its block of 4 x 4 points chooses its group of rays.
@@ -361,9 +361,11 @@ def _vectors(kind: Any, rows: FloatArray) -> Any:
     return kind(np.ascontiguousarray(rows.reshape(-1, 3).T, dtype=np.float32))
 
 
-def _square() -> FloatArray:
-    """Return 16 groups of points in the unit square, (16, rays, 2). All of them together are spread
-    evenly (Roberts 2018)."""
+def _square_points() -> FloatArray:
+    """Return points in the unit square, from which directions of shadow rays are made. There is a
+    group of them for each cell of a block of 4 x 4 cells of the floor, and in a group a point for
+    each ray of the cell: (16, RAYS_PER_CELL, 2). All points together are spread evenly (Roberts
+    2018)."""
     k = np.arange(SAMPLE_BLOCK * SAMPLE_BLOCK * RAYS_PER_CELL)
     plastic = 1.32471795724474602596  # the real root of x^3 = x + 1
     points = np.mod(0.5 + np.outer(k, [1 / plastic, 1 / plastic**2]), 1.0)
@@ -372,17 +374,24 @@ def _square() -> FloatArray:
 
 
 def key_light_points() -> FloatArray:
-    """Return 16 groups of points, (16, rays, 2), spread over the round key light: the distance to
-    its middle, for a light at distance 1, and the angle around it, in radians."""
+    """Return points spread over the round key light, the aims of shadow rays: 16 groups, one for
+    each cell of a block of 4 x 4 cells of the floor, (16, RAYS_PER_CELL, 2). The two numbers of a
+    point are its distance from the middle of a light at distance 1, and the angle around the
+    middle, in radians."""
     # The square root spreads points evenly over the disc.
     return np.stack(
-        [KEY_LIGHT_RADIUS * np.sqrt(_square()[..., 0]), 2 * math.pi * _square()[..., 1]], axis=-1
+        [
+            KEY_LIGHT_RADIUS * np.sqrt(_square_points()[..., 0]),
+            2 * math.pi * _square_points()[..., 1],
+        ],
+        axis=-1,
     )
 
 
 def _key_directions(key: Any) -> FloatArray:
-    """Return 16 groups of unit directions, (16, rays, 3), to points spread over the round key
-    light. key: (3,) the direction to its middle."""
+    """Return unit directions of shadow rays to points spread over the round key light: 16 groups,
+    one for each cell of a block of 4 x 4 cells of the floor, (16, RAYS_PER_CELL, 3). key: (3,) the
+    direction to the middle of the light."""
     axis = np.asarray(key, dtype=np.float64)
     # The coordinate axis that is farthest from `axis` gives a vector at right angles.
     tangent = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -395,11 +404,12 @@ def _key_directions(key: Any) -> FloatArray:
 
 
 def sky_directions() -> FloatArray:
-    """Return 16 groups of unit directions, (16, rays, 3), to the sky, distributed with the cosine
-    of their angle to the vertical."""
+    """Return unit directions of shadow rays to the sky: 16 groups, one for each cell of a block of
+    4 x 4 cells of the floor, (16, RAYS_PER_CELL, 3). Their density is proportional to the cosine of
+    the angle to the vertical."""
     # Uniform squares of the sine give the cosine distribution. The height is kept above 0, so that
     # no ray runs along the floor.
-    sine_squared, turn = np.moveaxis(_square(), -1, 0)
+    sine_squared, turn = np.moveaxis(_square_points(), -1, 0)
     sine = np.sqrt(sine_squared)
     return np.stack([sine * np.cos(2 * math.pi * turn), sine * np.sin(2 * math.pi * turn),
                      np.sqrt(np.maximum(1 - sine_squared, 1e-3))], axis=-1)  # fmt: skip

@@ -177,15 +177,20 @@ def _stencil_samples(
 def _without_truncation(
     field: Field, points: FloatArray, stencil: list[_StencilSample]
 ) -> list[_StencilSample]:
-    """The stencil (samples at the nodes) with the gradients of the exact field, without the
-    truncation error of a treecode (`exactly_sampled`). It is needed because the Hessian that a
-    treecode computes may be the derivative of its own gradient or of the exact one."""
+    """Return the stencil (samples at the nodes) with other gradients: those of the exact field,
+    without the truncation error of a treecode. It is needed because the Hessian that a treecode
+    computes may be the derivative of its own gradient or of the exact one.
+
+    points: (n, 3) the points around which the nodes lie.
+    stencil: the samples of the treecode at the nodes.
+    """
+    # `closely` samples without truncation error.
     error = sample_field(field, points, closely=True).gradient_error
     exact: list[_StencilSample] = []
     for node_sample in stencil:
         nodes = points + (node_sample.node * node_sample.h)[:, None] * np.eye(3)[node_sample.axis]
         sample = sample_field(field, nodes, closely=True)
-        # The errors at the point and at the node.
+        # `_StencilSample.gradient_error` is the sum of two errors: at the point and at the node.
         errors = error + sample.gradient_error
         exact.append(
             dataclasses.replace(node_sample, gradient=sample.gradient, gradient_error=errors)

@@ -44,14 +44,17 @@ _COARSE_FRACTION = 1e-4
 @dataclass(frozen=True)
 class JumpTraceState:
     """The state of rays through a function f with jumps at facets (triangles), between two
-    intervals of the march.
+    intervals. An interval is the part of a ray from one facet to the next, on which f is
+    continuous.
 
     offset: a number from which the field makes f on an interval (`Jumps.continuation`): that at the
         start of the ray (`Jumps.initial_offset`) plus all jumps since.
-    behind: the crossing of a facet that was passed last.
+    behind: the crossing of a facet from which the ray goes on: the last one so far.
     march: the state of the march.
     reported_facet: for rays that look for crossings of the level, the index of the facet that is
-        reported for the last one; None for other rays.
+        reported if the ray crossed the level at the facets behind which it is. If it met several
+        at the same point, this need not be the facet of `behind`. NO_FACET if the ray is behind no
+        facet so far. None for rays that look for first hits.
     """
 
     offset: Real

@@ -413,9 +413,10 @@ class Hysteresis:
         gaps: the differences to the true levels; they are returned for rays without contact.
         band: the tolerance in value.
         part: a fraction: 1 for proofs, less for the places at which trial steps aim. The level that
-            was reached counts as lying part * band beyond its true place. On the side from which
-            the ray came, f must stay nearer to this level than to the next one; so that next level
-            counts as lying `part` times half the spacing away from the level reached.
+            was reached counts as lying part * band beyond its true place. The next level on the
+            side from which the ray came counts as lying at part * spacing / 2 from the level
+            reached: half way or less. So steps prove that f stays nearer to the level reached than
+            to any other level, as long as the contact lasts.
         """
         # f minus the level reached.
         offset, far_gap = -self.levels.offset_to_nearest(value), part * _MAX_APPROACH * self.spacing

@@ -978,8 +978,9 @@ class March:
         return self.backend.UInt32(dr.select(is_hit, int(RayStatus.HIT), ended))
 
     def _deciding_gap(self, value: Real, ahead: JumpCrossing | None, at_end: Mask | None) -> Real:
-        """Return the difference between f and the nearest level. Where a trial point lies at a
-        facet, at which f jumps, it is the smaller of the differences before and behind the jump.
+        """Return |f - level| for the level nearest to f. By it the march decides whether the
+        accuracy of samples suffices. Where a trial point lies at a facet, at which f jumps, it is
+        the smaller of the two numbers before and behind the jump.
 
         value: f at the trial point, before the jump.
         ahead: the crossing of the facet at the end of the interval; None for functions without

@@ -487,12 +487,13 @@ class SurfaceTracer:
         the `Hysteresis` (the rule by which a crossing is counted).
 
         t_min, t_max: the ends of the ray.
-        start, end: the ends of the part of the ray in the proved extent of the surface.
+        start, end: the ends of the part of the ray in `volume`, the proved extent of the surface.
 
         The surface may touch the ends of this part, and then f does not change sign within it.
         Outside the part the ray meets no surface. So the part is made a little longer at both ends,
-        but not longer than the ray in `region`; and longer still for a ray that leaves a flat solid
-        at a small angle. Without a proved extent, the interval stays as it is.
+        and longer still for a ray that leaves a flat solid at a small angle. But it stays within
+        the ray and within `region`, the larger volume in which f may be evaluated. If no extent is
+        proved (`volume` is None), the interval stays as it is.
 
         Proof that this suffices if f is convex along the ray. Suppose that f is W below the level
         at some point of the extent, and reaches the level at the end of the extent. Let e be the
@@ -502,6 +503,9 @@ class SurfaceTracer:
         end, f is at least W/7 >= 8/7 e above the level, which a sample there shows.
         """
         never, size = self.backend.Bool(False), max_norm(path.origin)
+        # A bound of the rounding of the point o + t_min d, whose coordinates are at most
+        # size + t_min. A ray whose start is no farther than that from a facet (at which f jumps)
+        # counts as starting on it.
         rounding = _AT_JUMP_ROUNDINGS * self.backend.machine_epsilon * (size + t_min)
         if self.volume is None:
             # Nothing is known of levels before the interval and after it.
@@ -514,7 +518,9 @@ class SurfaceTracer:
         margin = _MARGIN_OF_LENGTH * length
         before = fmax(start - fmax(_MARGIN_OF_SIZE * (size + dr.abs(start)), margin), lowest_start)
         after = fmin(end + fmax(_MARGIN_OF_SIZE * (size + dr.abs(end)), margin), highest_end)
-        # An end that was moved only up to the end of the ray leaves unknown what lies beyond it.
+        # free_before, free_after: whether it is proved that the ray meets no level beyond this end
+        # of the interval. An end that could only be moved to the end of the ray, or of `region`,
+        # leaves that unknown.
         free_before, free_after = before > lowest_start, after < highest_end
         start, end = dr.select(is_nonempty, before, start), dr.select(is_nonempty, after, end)
         free = is_nonempty & free_before, is_nonempty & free_after

@@ -204,13 +204,13 @@ def _next_in_plane(
         faces of a leaf have updated."""
         node_low, node_high = vector(*node.head[:3]), vector(*node.head[3:6])
         is_near = dr.all((node_low <= high) & (node_high >= low))
-        return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
+        return is_near, for_each_primitive(node, is_near & node.is_leaf, lower_numbered, state)
 
-    def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """The new state: the number of the face in the record `row` if this face is sought and its
-        number is lower than `state`, the lowest so far; otherwise `state`. A face is sought if its
-        number is above `after`, it is larger than the lane's face (with the corners `corners` and
-        the size `size`), lies in its plane and overlaps it."""
+    def lower_numbered(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
+        """Return the new state: the number of the face in the record `row` if this face is sought
+        and its number is lower than `state`, the lowest so far; otherwise `state`. A face is sought
+        if its number is above `after`, it is larger than the lane's face (with the corners
+        `corners` and the size `size`), lies in its plane and overlaps it."""
         # The number -1 of an empty slot is no index; such a slot is never chosen.
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)

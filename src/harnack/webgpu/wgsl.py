@@ -101,8 +101,8 @@ def to_shader(kernel: ComputeKernel) -> Shader:
 
 class _WGSLWriter:
     """Writes a kernel as a shader, a program in WGSL, statement by statement. Each result of a
-    statement becomes a variable of the shader. Arrays are read from three buffers: data (single
-    numbers and tables), lanes (an entry per lane), and results.
+    statement becomes a variable of the shader. Arrays are in three buffers: "data" (single numbers
+    and tables) and "lanes" (arrays with an entry per lane) are read, "results" is written.
 
     _buffer_slots: for "number", "table" and "lane", the kernel parameters of this kind in the order
         of the buffers.
@@ -321,10 +321,11 @@ def _as_signed(text: str) -> str:
 def _float_comparison(predicate: str, x: str, y: str) -> str:
     """Return the WGSL expression that compares two floats x and y by an LLVM predicate. Predicates
     that begin with "o" (ordered) are false if an operand is NaN; those that begin with "u"
-    (unordered) are true.
+    (unordered) are true. "ord" and "uno" test only whether no operand is NaN, or any.
 
-    Ordered comparisons are WGSL's own, which are false for NaN. An unordered one is the negation of
-    the opposite comparison.
+    WGSL's own <, <=, >, >= and == are false for NaN, as ordered comparisons are. An unordered
+    inequality is the negation of the opposite one: "ult" is !(x >= y). WGSL's != is true for NaN.
+    Equality and inequality ("ueq", "one", "une") test for NaN by its bits.
     """
     if predicate in ("ord", "uno"):
         any_nan = f"is_nan({x}) | is_nan({y})"

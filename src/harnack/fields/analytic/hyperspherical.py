@@ -110,6 +110,8 @@ class _OrderTerm:
         # C, C' and C'' at w = 1; below, bounds of S, of its gradient and of its Hessian.
         c, first, second = (float(number) for number in self.axial(1.0))
         value, slope, curvature = self.value(rho, r), self.gradient(rho, r), self.hessian(rho, r)
+        # The second derivative along a unit vector (u, v), with u in R^3, has the mixed term
+        # 2 v (u . grad S) C'. As 2 |u| |v| <= 1, this is at most slope * first, without a factor 2.
         return slope * c + value * first, curvature * c + slope * first + value * second
 
     def axial(self, w: Real) -> tuple[Real, Real, Real]:

@@ -556,7 +556,16 @@ class Molecule(Blobs):
         sharpness: float = 1.0,
         tail: float = 1 / 32,
     ) -> None:
-        """Read the atoms, and set up a blob with a Gaussian kernel for each."""
+        """Read the atoms, and set up a blob with a Gaussian kernel for each.
+
+        source: a .pdb, .ent, .cif or .mmcif file, or `Atoms`.
+        sharpness: the number s in exp(-s (d/r)^2), with d the distance from an atom of the radius
+            r. The larger it is, the closer the surface follows the single atoms.
+        tail: an atom ends where its Gaussian is this fraction of its value at the radius.
+
+        Raises:
+            FileFormatError: a file that does not hold a molecule.
+        """
         self.atoms = source if isinstance(source, Atoms) else read_molecule(source)
         record_arguments(self, source=self.atoms)  # so that `replace` reads no file
         super().__init__(

@@ -279,7 +279,7 @@ def _carve_boxes(
     """Make boxes of faces smaller: divide each into cells, remove cells that are proved to contain
     no level set, and take the box around the rest.
 
-    carved: (k,) the indices of the faces whose boxes are made smaller.
+    carved: (k,) the indices of the faces whose boxes are made smaller, in increasing order.
     lower, upper: (m, 3) corners of the old boxes of all faces.
     levels: the values of the solid angle whose level sets the boxes must contain.
 
@@ -296,7 +296,8 @@ def _carve_boxes(
     for round_index in range(_ROUNDS):
         is_split = cells.depth < _MIN_DEPTH
         if round_index >= _MIN_DEPTH:
-            # Only cells at the sides of the box. place: that of each cell's face in `carved`.
+            # Only cells at the sides of the box. place: for each cell the position of its face in
+            # `carved`, found by bisection, since these indices increase.
             place = np.searchsorted(carved, cells.face)
             is_split = cells.touch(low[place], high[place], box_sizes) & (cells.depth < _MAX_DEPTH)
         # The number of pairs of an octant and a corner: the work so far.

@@ -3,7 +3,7 @@ from the mesh, negative inside. Its size is found from the nearest triangle, and
 winding number: how often the mesh winds around a point, which is counted by the crossings of a ray
 with the mesh. Points are used in unit coordinates, in which the mesh has a size of about 1.
 `ClosedSurface.of` finds the faces of a mesh that bound the solid, and refuses a mesh that bounds
-none.
+none. A jet holds proved ranges of a number and of its derivatives by some variables.
 
 Why a ray decides whether a point is inside. The usual way would be the normals of edges and
 vertices, weighted by angles. But near triangles as thin as rounding these normals decide nothing.
