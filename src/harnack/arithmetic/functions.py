@@ -95,8 +95,9 @@ def _twice(x: Interval) -> Interval:
 
 
 def _unbounded_unless_defined(defined: Mask, ranges: DerivativeRanges) -> DerivativeRanges:
-    """The three `ranges`; on lanes where `defined` is False, those of the derivatives are replaced
-    by all numbers, because the function has a pole or no value somewhere in the interval.
+    """Return the three `ranges`, with the ranges of both derivatives replaced by all numbers on
+    lanes where `defined` is False: there the function has a pole or no value somewhere in the
+    interval.
 
     ranges: of the function, of its derivative and of its second derivative.
     """

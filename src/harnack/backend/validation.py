@@ -259,7 +259,7 @@ _PLAIN_TYPES = frozenset(
     (str, bytes, bool, int, float, complex, np.ndarray, np.float64, type(None))
 )
 _CONTAINER_TYPES = (list, tuple, set, frozenset)
-# Functions of these packages refer to no numbers of the caller's.
+# Functions of these packages use no numbers of the caller.
 _KNOWN_PACKAGES = frozenset(("harnack", "drjit", "numpy", "math"))
 
 

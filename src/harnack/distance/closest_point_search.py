@@ -285,11 +285,12 @@ def _with_singular_points(
 def _closest_on_mesh(
     backend: Backend, surface: TracedSurface, levels: Levels, mesh: LevelTriangles, points: Any
 ) -> ClosestPoints:
-    """Find the closest point to each query on a surface that consists of triangles only. Parameters
-    and result are those of `find_closest`. The lower bound is the distance less an allowance for
-    rounding.
+    """Find the closest point to each query on a surface that consists of triangles only. In the
+    result, the lower bound of a distance is the distance less an allowance for rounding.
 
+    backend, surface, levels: the surface, and on which backend its function is evaluated.
     mesh: the triangles of the surface.
+    points: (n, 3) the queries.
     """
     prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
 
@@ -636,7 +637,7 @@ class _QueryEvaluator:
 
         Returns the closest point, NaN if none is found; the radius of a ball about it in which no
         surface point is nearer to x; and the mask of lanes for which `descend` has to be called
-        afterwards: those in which the method did not converge, or led out of the domain or to its
+        afterwards, because the method did not converge, or led out of the domain or to its
         boundary.
         """
         # x has the types of the other kernel, perhaps of another precision; the results get them.

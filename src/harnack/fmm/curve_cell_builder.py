@@ -396,8 +396,8 @@ def near_records(
     vertices: VertexTable, runs: EdgeRuns, is_leaf: BoolArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Make the records of the near edges of the cells that are not split, as `CurveCells.near`
-    describes them. A cell's records hold the vertices of its near runs, one after another: those of
-    the run itself, then, unless the run is a whole loop, the apex and the first vertex again.
+    describes them. A cell's records hold its near runs, one after another: the vertices of a run,
+    then, unless the run is a whole loop, its apex and its first vertex again.
 
     vertices: the table of the curve's vertices.
     runs: the near runs of all n cells, closed by apexes.

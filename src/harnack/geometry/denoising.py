@@ -187,10 +187,10 @@ def _min_variance_axes(offsets: FloatArray, weights: FloatArray | None) -> Float
 def _deviations_by_normals(
     offsets: FloatArray, normals: FloatArray, neighbor_normals: FloatArray
 ) -> FloatArray:
-    """For each of m points, the standard deviation (m,) of the heights t_j of the surface that are
-    predicted by those of its neighbors that have a similar normal. A neighbor j with the offset d_j
-    and the normal n_j predicts the surface at the height t_j = (n + n_j)/2 . d_j above a point with
-    the normal n.
+    """For each of m points, compute the standard deviation (m,) of the heights of the surface that
+    its neighbors predict. A neighbor j with the offset d_j and the normal n_j predicts the surface
+    at the height t_j = (n + n_j)/2 . d_j above a point with the normal n. Only neighbors with a
+    similar normal count.
 
     offsets: (m, k, 3) from each point to its neighbors.
     normals: (m, 3) the unit normals of the points.

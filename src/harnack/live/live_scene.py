@@ -541,7 +541,7 @@ def _studio_objects(surfaces: Any, options: Mapping[str, Any]) -> list[StudioObj
 
 
 def _surface_and_trace(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the options that are keywords of `Surface` or options of traces.
+    """Return, of the given options, all that are keywords of `Surface` or options of traces.
 
     Raises:
         TypeError: an option is none that `view` has.

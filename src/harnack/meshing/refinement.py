@@ -187,9 +187,9 @@ def _project_to_creases(
     sides of the crease are flat (Kobbelt et al. 2001). The new vertex is where the segment from the
     midpoint to this point passes the level.
 
-    An edge cuts off a crease if the normals at its ends differ by 20 degrees or more, and the
-    normals at the moved midpoint and at one of the ends differ by nearly that angle. On a smooth
-    surface the latter two differ by about half of it. The given vertex is also kept if the segment
+    An edge cuts off a crease if the normals at its ends differ by an angle a of more than 20
+    degrees, and the normal at the moved midpoint differs from one of them by nearly a (on a smooth
+    surface, by about a/2). For other edges the given vertex is kept. It is also kept if the segment
     does not pass the level, or passes it too near to an end of the edge.
     """
     used, vertex_rows = np.unique(ends, return_inverse=True)
@@ -315,10 +315,11 @@ def _level_along(
 def unrefined_midpoints(
     function: LevelFunction, vertices: FloatArray, faces: IntArray, tolerance: float
 ) -> FloatArray:
-    """(k, 3) the midpoints of the edges of a mesh that `refine` would still split, because the mesh
-    is farther than `tolerance` (a length) from the level set there.
+    """Return the midpoints (k, 3) of the edges of a mesh that `refine` would still split, because
+    the mesh is farther than `tolerance` (a length) from the level set there.
 
     function: f - level for a field f; it is 0 on the level set.
+    vertices, faces: the mesh, (n, 3) and (m, 3).
     """
     # Without walls, and everywhere.
     marks = _RefinementMarks.of(function, vertices, faces, tolerance, None, None)

@@ -477,8 +477,8 @@ def studio_wall(
 
 
 def _far_shaded(mi: Any, sensor: Any, ground: GroundBackdrop) -> FloatArray:
-    """Compute the radiance (3,) of the ground far from the stage, in the light of shaded
-    pictures."""
+    """Compute the radiance (3,) of the ground far from the stage, in the light of shaded pictures.
+    The light moves with the camera, `sensor`."""
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     color = mi.Color3f(*reflectance_of(ground.name).tolist())
     up, one = mi.Vector3f(0, 0, 1), mi.Float(1)

@@ -585,8 +585,8 @@ class March:
         t: the ray parameters of the points; ray_sample: the samples there.
         gaps: the differences between f at the point and the next levels below and above.
         size: a bound of the absolute values of coordinates on the ray up to the points.
-        is_near: mask of points to be tested: those near a level by the slope of f, and those where
-            rounding of the point may hide the level.
+        is_near: mask of points to be tested. They are near a level by the slope of f, or rounding
+            of the point may hide the level.
         touches: mask of points at which f may equal the level up to rounding.
 
         f must take the level within the hit tolerance, or within twice the rounding of the point if
