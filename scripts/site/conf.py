@@ -135,7 +135,17 @@ def name_aliases(
     return next(plain), next(plain)
 
 
+def skip_default_sample_ray(
+    app: Any, what: str, name: str, thing: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leave out the `sample_ray` of `Field` where other classes hold it: `Field` sets it in those
+    that define `evaluate`. Its own entry also lists what it inherits."""
+    is_default = thing is harnack.Field.sample_ray
+    return True if is_default and not options.inherited_members else None
+
+
 def setup(app: Any) -> None:
+    app.connect("autodoc-skip-member", skip_default_sample_ray)
     app.connect("autodoc-process-signature", name_aliases)
     app.connect("source-read", add_contents)
     app.connect("build-finished", add_index)
