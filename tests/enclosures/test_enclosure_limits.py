@@ -216,7 +216,7 @@ KINDS = sorted(kinds_of(enclosures) | kinds_of(literature), key=lambda kind: kin
 
 def test_every_enclosure_is_tried() -> None:
     """Those of fields are imported above."""
-    assert kinds_of(harnack) == set(KINDS)
+    assert kinds_of(harnack) == set(KINDS), "import its module in this file"
 
 
 class Numbers:

@@ -1,8 +1,9 @@
 """Enclosures: proofs of how far a function f can change along a path (a ray) from its value at a
 sampled point. They prove lengths of the ray on which f takes none of given values, the levels.
 
-This package exports what all proofs share. The proofs themselves, the classes of enclosures, are
-names of `harnack`; `harnack/__init__.pyi` lists them.
+This package exports what all proofs share. The classes of enclosures are in the modules
+of this package, and those that users name also in `harnack.proofs`. Those of the literature, which
+are there for comparison, are in `harnack.literature`.
 """
 
 from __future__ import annotations

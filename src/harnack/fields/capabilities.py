@@ -9,7 +9,7 @@ that lacks it:
 - `Field.patches`, a `Patches`: the surface is the union of many level sets (patches), each of its
   own function and inside its own box.
 - `Field.boundary`, a `Boundary`: every level set ends at the same curves or points.
-- `Field.accuracy`, an `VariableAccuracy`: f can be sampled with different accuracy.
+- `Field.variable_accuracy`, a `VariableAccuracy`: f can be sampled with different accuracy.
 
 Accuracy of sums over trees. The smaller the truncation error of a sum over a tree, the higher its
 cost; and far from the surface a large error does no harm. So `VariableAccuracy.at` takes any

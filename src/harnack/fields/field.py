@@ -82,7 +82,7 @@ class Field(Parametrized, abc.ABC):
 
     Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
     Optional capabilities are objects (`capabilities`): `jumps`, `modulo_one`, `patches`,
-    `boundary` and `accuracy`. They are None for a field that has none of these.
+    `boundary` and `variable_accuracy`. They are None for a field that has none of these.
     """
 
     period: ClassVar[float | None] = None

@@ -191,7 +191,8 @@ def check_enclosure(
     if not accepted:
         raise ValueError(
             f"{kind.__name__} applies to none of the promises there are; define its classmethod "
-            "of(promise, value, error, slopes), which returns an enclosure for its kind of promise"
+            "from_promise(promise, value, error, slopes), which returns an enclosure for its kind "
+            "of promise"
         )
 
 
