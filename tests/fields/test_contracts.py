@@ -157,6 +157,7 @@ OWN: dict[str, Field] = {
     "charges": Charges(),
     "azimuth": Azimuth(),
     "plane": Plane(),
+    "evaluation only": hk.fields.EvaluateOnly(Plane().evaluate),
     **{name: field for name, (field, _) in SOURCED.items()},
 }
 _POINTS = np.random.default_rng(5).normal(size=(60, 3))
@@ -197,7 +198,13 @@ PROMISES_OF: dict[str, tuple[Promise, ...]] = {
     ),
     **dict.fromkeys(("charges", "azimuth"), (_PLANE_BALL,)),
     **dict.fromkeys(
-        ("hyperspherical 4,2,1", "hyperspherical 6,6,5, in a ball", "plane"), (_STEEP, _BENT)
+        (
+            "hyperspherical 4,2,1",
+            "hyperspherical 6,6,5, in a ball",
+            "plane",
+            "evaluation only",
+        ),
+        (_STEEP, _BENT),
     ),
     **dict.fromkeys(("lobes 3,2", "lobes 2,1, positive", "Fourier series", "smoothed"), (_BENT,)),
     **dict.fromkeys(SOURCED, (BoundedLaplacian(1.0, -1.0, 1.0, -1.0, 1.0),)),

@@ -249,3 +249,42 @@ def test_a_field_that_holds_a_field_of_the_library_is_prepared_with_it() -> None
     np.testing.assert_array_equal(hits.status, expected.status)
     assert hits.is_hit.sum() > 50
     np.testing.assert_allclose(hits.t[hits.is_hit], expected.t[hits.is_hit], atol=1e-3)
+
+
+class Rounded(Field):
+    """x, off by 0.5/scale^power at an accuracy scale, and by nothing at large scales."""
+
+    default_level = 0.3
+    domain = hk.Ball(radius=2.0)
+
+    def __init__(self, power: float) -> None:
+        self.power = power
+
+    def evaluate(self, p: Any) -> Sample:
+        return self.variable_accuracy.at(1.0 + 0 * p.x).evaluate(p)
+
+    @property
+    def variable_accuracy(self) -> hk.fields.VariableAccuracy:
+        def at(scale: Any) -> Field:
+            off = 0.5 * dr.maximum(scale, 0.25) ** -self.power
+            off = dr.select(scale < 1e5, off, 0)
+            known = (Lipschitz(1.0),)
+            return hk.fields.EvaluateOnly(
+                lambda p: Sample(
+                    p.x + off, type(p)(1.0, 0.0, 0.0), known, off, truncation_error=off
+                )
+            )
+
+        return hk.fields.VariableAccuracy(at, coarsest=0.25)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 3.0, 6.0])
+def test_truncation_may_fall_as_any_power_of_the_scale(power: float) -> None:
+    hits = hk.trace(Rounded(power), [[1.5, 0, 0]], [[-1.0, 0, 0]], tolerance=1e-3)
+    assert hits.status[0] == hk.RayStatus.HIT
+    assert hits.t[0] == pytest.approx(1.2, abs=1.1e-3)
+
+
+def test_a_field_of_a_function_takes_functions_only() -> None:
+    with pytest.raises(TypeError, match="evaluate must be a function that takes"):
+        hk.fields.EvaluateOnly(hk.Gyroid(1.0))  # type: ignore[arg-type]

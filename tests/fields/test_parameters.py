@@ -204,6 +204,9 @@ _CASES: dict[str, _Case] = {
     "curves": (lambda radius: hk.SolidAngle([hk.geometry.Circle(radius), _TRIANGLE]),
                {"radius": 0.5}, {"loops.0", "loops.1.radius", "loops.1.center", "loops.1.normal"},
                ("loops.1.radius", 0.7, {"radius": 0.7})),
+    "evaluation only": (hk.fields.EvaluateOnly, {"evaluate": hk.Gyroid(1.0).evaluate}, set(),
+                        ("evaluate", hk.Gyroid(2.0).evaluate,
+                         {"evaluate": hk.Gyroid(2.0).evaluate})),
     "a user's": (Charge, {"center": (0.1, 0.2, 0.3)}, {"center", "strength"},
                  ("strength", 3.0, {"strength": 3.0})),
 }  # fmt: skip

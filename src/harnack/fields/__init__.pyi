@@ -23,7 +23,7 @@ from .capabilities import (
     VariableAccuracy,
 )
 from .expressions import expression
-from .field import Field, Sample
+from .field import EvaluateOnly, Field, Sample
 from .formula import Formula
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
@@ -42,6 +42,7 @@ __all__ = [
     "BranchPoint",
     "DipolePotential",
     "EigenfunctionSum",
+    "EvaluateOnly",
     "Field",
     "Formula",
     "FormulaSolid",

@@ -44,7 +44,8 @@ class JumpCrossing:
     a ray, which lies on no facet, is represented in the same way.
 
     t: the ray parameter; inf if no facet is crossed.
-    facet: the index of the facet, a Dr.Jit UInt32; NO_FACET if there is none.
+    facet: the index of the facet, a Dr.Jit UInt32; NO_FACET if there is none. Indices are below
+        2^31, because `Hits.primitive_index` is an array of signed numbers.
     jump: f just behind the facet minus f just before it, along the ray; 0 if there is no facet.
     normal: (3,) the unit normal of the facet on the side where f is larger: (normal . d) jump >= 0.
         It is meaningless if there is no facet.
@@ -105,7 +106,9 @@ class Jumps(abc.ABC):
 
     The promises of a sample (proved bounds of f near a point) are about f continued smoothly
     through all facets. Where a ray crosses a facet, the values just before and just behind it are
-    compared with the levels.
+    compared with the levels. So the surface consists of the points off the facets at which f takes
+    a level, and of the points of facets with a level between the limits of f from both sides. What
+    `Field.evaluate` gives at a point on a facet does not matter for that; it may be either limit.
 
     A field with jumps is real-valued (it has no period). Subclasses define two methods:
     `next_crossing` gives the next crossing of a ray, and `continuation` gives the field on the
@@ -161,7 +164,8 @@ class Jumps(abc.ABC):
 
         The field's `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
         rounding. At the two ends it gives the limit from inside the interval, even if rounding puts
-        p on the other side of the facet, or if the two t are equal. Its promises (proved bounds
+        p on the other side of the facet, or if the two t are equal. A field that consists of such
+        a function and of nothing else is `EvaluateOnly(function)`. Its promises (proved bounds
         near p) are about the continued function. The tracer uses them only between the two
         crossings.
         """
@@ -328,10 +332,12 @@ class VariableAccuracy:
     gives the coarsest samples of the field, 1 the samples of `Field.evaluate`, and a number above 1
     more accurate samples.
 
-    at: a function that takes an accuracy scale and returns the field, sampled with it.
-        `Sample.truncation_error` falls about as the third power of the scale, and is 0 if the scale
-        is large enough (`EXACT`). A coarse sample is as valid as any other; its `value_error` is
-        larger.
+    at: a function that takes an accuracy scale and returns the field, sampled with it; in the
+        simplest case an `EvaluateOnly`. `Sample.truncation_error` falls with the scale, and is 0 if
+        the scale is large enough (`EXACT`). How fast it falls matters for the time
+        only: the scales that the tracer tries suit about the third power, and steps are proved for
+        any. The largest that it tries is 10^6, where the truncation error should be 0. A coarse
+        sample is as valid as any other; its `value_error` is larger.
     coarsest: the accuracy scale of the coarsest samples, in (0, 1]. A smaller scale, such as 0,
         gives no coarser samples, but for the next attribute.
     may_lack_integer: whether samples with a scale below `coarsest` may give f only modulo 1. Those

@@ -468,10 +468,22 @@ class Field(Parametrized, abc.ABC):
 
 
 class EvaluateOnly(Field):
-    """A field that consists of its method `evaluate` only, such as the result of
-    `VariableAccuracy.at`. Its constructor takes the function that returns the sample at a point."""
+    """A field that consists of its method `evaluate` only. It is the simplest result of
+    `VariableAccuracy.at` and of `Jumps.continuation`, which are called for a field that is prepared
+    already: `prepare` does nothing here. What the function uses of other fields must be on the
+    backend on which it is called.
+
+    evaluate: a function that takes a point p, a Dr.Jit 3-vector, and returns the `Sample` there.
+
+    Raises TypeError if it is not a function.
+    """
 
     def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
+        if not callable(evaluate):
+            raise TypeError(
+                "evaluate must be a function that takes a Dr.Jit 3-vector and returns a "
+                f"harnack.fields.Sample, not {evaluate!r}"
+            )
         self._evaluate = evaluate
 
     def evaluate(self, p: Vec3) -> Sample:
