@@ -7,6 +7,7 @@ Harmonics have degree l and order m.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -27,8 +28,15 @@ from harnack.fmm.multipole import (
     triangle_tree_moments,
     truncation_bounds,
 )
-from harnack.fmm.source_sums import max_step_fraction
-from harnack.fmm.treecode import multipole_terms, node_records
+from harnack.fmm.source_sums import (
+    MAX_STEP_FRACTION,
+    TAYLOR_RADII,
+    SourceSums,
+    max_step_fraction,
+    remainder_factor,
+    singularity_fraction,
+)
+from harnack.fmm.treecode import COARSE_RATIO, multipole_terms, node_records
 from harnack.tree import BalancedTree, build_balanced_tree
 
 ORDERS = [0, 1, 2]
@@ -446,6 +454,44 @@ def test_fields_of_nodes_bend_as_their_columns_say(rough: float) -> None:
             for way in (inwards, unit(inwards + rng.normal(size=(60, 3)))):
                 off, bound = bent(level, rough, way, part, y, normal)
                 assert (off <= bound * (1 + 1e-9) + tiny).all()
+
+
+@pytest.mark.parametrize("ratio", [1.5, 2.0, COARSE_RATIO])
+def test_numbers_of_the_proof_of_steps_agree(ratio: float) -> None:
+    """What the proof in `SourceSums.sample` says of radii, far nodes and chords."""
+    assert list(TAYLOR_RADII) == sorted(TAYLOR_RADII)
+    # The largest ball, about a node that counts as a singular point, is the longest step.
+    longest = TAYLOR_RADII[-1] * singularity_fraction(ratio)
+    assert longest == pytest.approx(max_step_fraction(ratio), rel=1e-12)
+    # It ends before the node's dipoles, and reaches no farther than the chord of phi.
+    assert max_step_fraction(ratio) <= MAX_STEP_FRACTION * (1 - 1 / ratio) < 1 - 1 / ratio
+    assert singularity_fraction(ratio) <= 1
+    real = choose_backend("double").Float
+    sums = SourceSums.zero(choose_backend("double"), 1.0, 0)
+    for b in TAYLOR_RADII:
+        sums = dataclasses.replace(sums, s4=real(1), s5=real(1))
+        for q in np.linspace(0, b, 9):
+            # A dipole of area 1 at the distance 1.
+            assert remainder_factor(q) <= to_numpy(sums.remainder(b, real(q)))[0] * (1 + 1e-12)
+        chord = to_numpy(sums.remainder(b, real(b)))[0]
+        assert chord == pytest.approx(remainder_factor(b), rel=1e-12)
+
+
+def test_a_mass_counts_as_a_dipole() -> None:
+    """m/rho has Taylor remainders of at most those of a dipole of area m rho/3 (`source_sums`)."""
+    rng = np.random.default_rng(8)
+    rho = rng.uniform(0.5, 2, 400)
+    t = rng.uniform(0.01, 0.99, 400) * rho
+    way = unit(rng.normal(size=(400, 3)))
+    way[:100] = (-1.0, 0, 0)
+    x = np.stack([rho, 0 * rho, 0 * rho], axis=1)
+    linear = 1 / rho - t * way[:, 0] / rho**2
+    off = np.abs(1 / np.linalg.norm(x + t[:, None] * way, axis=1) - linear)
+    bound = (rho / 3) * t**2 / rho**4 * np.array([remainder_factor(q) for q in t / rho])
+    assert (off <= bound * (1 + 1e-9)).all()
+    # Short steps toward it attain the bound.
+    short = 1 / (1 - 1e-3) - (1 + 1e-3)
+    assert short == pytest.approx(1e-6 / 3 * remainder_factor(1e-3), rel=2e-3)
 
 
 @pytest.mark.parametrize("rough", [1.5, 2.5])

@@ -5,6 +5,15 @@ it makes values with error bounds, or a `Sample`: value and gradient of f at x w
 which are proved bounds of f near x.
 
 Two symbols occur throughout: a is the area of a dipole, and rho is its distance from x.
+
+Sources of another kind. A source counts as a dipole of area a if its k-th derivatives along lines
+are at most (k+1)! a/rho^(k+2) for all k >= 2: the proof in `SourceSums.sample` uses nothing else of
+a dipole, but that f is harmonic off the sources. For a mass m, with the potential m/rho, these
+derivatives are at most k! m/rho^(k+1), so that a = m rho/3. Three things are derived for dipoles
+alone, and have to be derived anew: `dipole_rounding`, which `SourceSums.add_far_node` uses as well;
+the numbers `SLOPE_ROUNDINGS` and `SECOND_ROUNDINGS`, beyond which the rounding of a source's
+gradient and second derivatives is added to `gradient_truncation` and `hessian_truncation`; and the
+numbers A and K of a far node (`multipole.remainder_constants`).
 """
 
 from __future__ import annotations
@@ -24,11 +33,11 @@ from harnack.fmm.point_values import PointValues, SymmetricMatrix
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
 
-# Radii of the balls about x on which second derivatives of f are bounded (`TaylorRemainder`), as
-# fractions of the distance to the nearest singular point. A smaller ball has a smaller bound.
-_TAYLOR_RADII = (0.2, 0.4, 0.6)
-# The largest radius of such a ball, as a fraction of the distance to the dipoles of far nodes.
-_MAX_STEP_FRACTION = 0.65
+TAYLOR_RADII = (0.2, 0.4, 0.6)
+"""Radii of the balls about x on which second derivatives of f are bounded (`TaylorRemainder`), as
+fractions of the distance to the nearest singular point. A smaller ball has a smaller bound."""
+MAX_STEP_FRACTION = 0.65
+"""The largest radius of such a ball, as a fraction of the distance to the dipoles of far nodes."""
 # Bounds are enlarged, and distances reduced, by this fraction, for the rounding of sums.
 SUM_MARGIN = 2e-5
 # A singular point counts as near if its distance is at most this many roundings of a coordinate.
@@ -45,16 +54,19 @@ def max_step_fraction(coarse_ratio: float) -> float:
 
     coarse_ratio: a node is far if its center is farther from x than this many times its radius.
     """
-    return _MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
+    return MAX_STEP_FRACTION * (1 - 1 / coarse_ratio)
 
 
-def free_radius_fraction(coarse_ratio: float) -> float:
-    """The radius of a ball around x that contains no dipole of a far node, as a fraction of the
-    distance from x to the center of the node.
+def singularity_fraction(coarse_ratio: float) -> float:
+    """The distance at which a far node counts as a singular point, as a fraction of the distance
+    from x to the center of the node. The largest of `TAYLOR_RADII` times it is `max_step_fraction`,
+    the longest step of the proof. (It may itself be longer than the distance of the node's nearest
+    dipole; the longest step is not.)
 
-    coarse_ratio: a node is far if its center is farther from x than this many times its radius.
+    coarse_ratio: a node is far if its center is farther from x than this many times its radius. It
+        is at most 13: then the result is at most 1, which the proof in `SourceSums.sample` needs.
     """
-    return max_step_fraction(coarse_ratio) / _TAYLOR_RADII[-1]
+    return max_step_fraction(coarse_ratio) / TAYLOR_RADII[-1]
 
 
 def remainder_factor(q: float) -> float:
@@ -124,7 +136,7 @@ class SourceSums:
         None without a Hessian.
     rounding: a bound of the rounding error of the value.
     singularity_distance: the distance from x to the nearest singular point, which is a dipole or a
-        point of an edge; or `free_radius_fraction` times the distance to the nearest far node's
+        point of an edge; or `singularity_fraction` times the distance to the nearest far node's
         center, if that is smaller.
     s4, s5: the sums of a/rho^4 and of a/rho^5 over all sources. For a dipole at the distance rho, a
         is its area. For a far node, rho is the distance of its center, and a is A + K/rho^2 with
@@ -249,7 +261,8 @@ class SourceSums:
             distance of the center).
         left_out: bounds of the truncation errors that the node causes: of the value, of the
             gradient and of second derivatives; 0 on lanes where the node is not far.
-        free: a distance from x within which none of the node's dipoles lies.
+        free: the distance at which the node counts as a singular point: `singularity_fraction`
+            times that of its center.
         unit: a bound of the rounding error of a coordinate.
         """
         # With a = `size` and rho = 1/`inverse`: s4 grows by a/rho^4, s5 by a/rho^5.
@@ -330,12 +343,13 @@ class SourceSums:
         area A + K/r^2 at its center, for t/r <= `max_step_fraction`
         (`multipole.remainder_constants`). phi is convex. So on [0, b] it lies below its chord 3 +
         rise q, with rise = (phi(b)-3)/b = (4-3b)/(1-b)^2. Now let R be b times
-        `singularity_distance`, and g the gradient of f at x. Summed over all sources, for t = |y -
-        x| <= R,
+        `singularity_distance`, and g the gradient of f at x. For t = |y - x| <= R, t/rho <= b for
+        all dipoles, and t/r <= b for all far nodes, because `singularity_fraction` is at most 1.
+        Summed over all sources,
 
             |f(y) - f(x) - g.(y-x)| <= t^2 (3 s4 + rise R s5).
 
-        This is the `TaylorRemainder` for each b in `_TAYLOR_RADII`. On the ball of the largest
+        This is the `TaylorRemainder` for each b in `TAYLOR_RADII`. On the ball of the largest
         radius R, f changes by at most |g| R plus this bound for t = R, which gives the range of the
         `HarmonicBall`. f is harmonic there: the dipoles of far nodes are farther away than 1 -
         1/coarse_ratio times the distance of the center, and `max_step_fraction` is less than that.
@@ -345,7 +359,7 @@ class SourceSums:
         # The distance to the nearest singular point, reduced for rounding.
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
         # A TaylorRemainder bounds the second derivative, so its constant is twice that of t^2.
-        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in _TAYLOR_RADII]
+        scale, radii = (2 + 2 * SUM_MARGIN) * share, [(b, b * distance) for b in TAYLOR_RADII]
         taylor = [TaylorRemainder(scale * self.remainder(b, r), r) for b, r in radii]
         slope, largest = dr.norm(g) + slope_error, taylor[-1]
         r = largest.radius
@@ -403,7 +417,7 @@ class SourceSums:
         slope = dr.abs(dr.dot(self.gradient, v)) + self.gradient_truncation
         slope = dr.fma(SLOPE_ROUNDINGS * unit, self.s4, slope)
         # R is this fraction of the distance to the nearest singular point, less rounding.
-        fraction = _TAYLOR_RADII[-1]
+        fraction = TAYLOR_RADII[-1]
         radius = fraction * (self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit)
         # Without sources s5 is 0 and R may be infinite; then R s5 would be NaN.
         remainder = self.remainder(fraction, dr.select(self.s5 > 0, radius, 0))

@@ -11,6 +11,12 @@ by itself.
   primitives of near leaves.
 - `multipole_terms`: the terms of a far node in value, gradient and Hessian.
 - `dipole_records`, `records_in_slots`: oriented points as records, also in the leaves of a tree.
+
+`traverse_clusters` and `dipole_hierarchy` are for points of any kind, whose records and moments the
+caller makes. All else here is for dipoles: moments begin with the degree l = 1, as those of a
+dipole do, while those of a mass begin with l = 0 (`multipole.MOMENT_KEYS`); records have eight
+numbers; and `Treecode.sums` asks the caller for the terms of near primitives, and makes those of
+far nodes itself. `source_sums` says what other kinds of sources need for bounds.
 """
 
 from __future__ import annotations
@@ -31,7 +37,7 @@ from harnack.fmm.multipole import (
     truncation_bounds,
 )
 from harnack.fmm.point_values import SymmetricMatrix
-from harnack.fmm.source_sums import SourceSums, SourceTerm, free_radius_fraction
+from harnack.fmm.source_sums import SourceSums, SourceTerm, singularity_fraction
 from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree import (
     NO_PRIMITIVE,
@@ -123,8 +129,8 @@ _LEAF_SIZE, _ARITY = 8, 4
 
 
 def dipole_hierarchy(points: FloatArray) -> BalancedTree:
-    """Build the balanced tree over points (n, 3): which points are in which node. It holds no
-    positions and no moments."""
+    """Build the balanced tree over points (n, 3), those of dipoles or of others: which points are
+    in which node. It holds no positions and no moments."""
     return build_balanced_tree(points, leaf_size=_LEAF_SIZE, arity=_ARITY)
 
 
@@ -262,8 +268,9 @@ def _hessian(
 
 ExtraState: TypeAlias = "tuple[Any, ...]"
 
-# Coarse evaluations use the moments of a node beyond this many times its radius.
-_COARSE_RATIO = 2.5
+COARSE_RATIO = 2.5
+"""Coarse evaluations use the moments of a node beyond this many times its radius, or beyond
+`Treecode.accuracy` times it where that is less."""
 # The number of roundings by which the gradient of a far node itself may be wrong.
 _FAR_GRADIENT_ROUNDINGS = 64.0
 # If no term bounds the distance that is free of sources, it is taken to be this many times one plus
@@ -350,7 +357,7 @@ class Treecode:
         divided by `coarse_error_ratio`. This ratio is the median, over the leaves, of the ratio of
         the two bounds.
         """
-        coarse_ratio = min(accuracy, _COARSE_RATIO)
+        coarse_ratio = min(accuracy, COARSE_RATIO)
         fine_bounds = [truncation_bounds(level, accuracy * level.radius, order) for level in levels]
         coarse_bounds = [
             truncation_bounds(level, coarse_ratio * level.radius, order) for level in levels
@@ -406,31 +413,30 @@ class Treecode:
         """
         # The records of nodes hold accepting distances for the coarse ratio; `closer` is the factor
         # from these to the distances for this accuracy scale.
-        free_fraction, closer = (
-            free_radius_fraction(self.coarse_ratio),
+        singular_share, closer = (
+            singularity_fraction(self.coarse_ratio),
             self.acceptance_ratio(detail) / self.coarse_ratio,
         )
         unit = coordinate_rounding(x)
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
-            of the sums and the caller's own state. `free_fraction` times the distance of the node's
-            center is the radius of a ball around x that is free of the node's sources. Returns the
-            new state."""
+            of the sums and the caller's own state. At `singular_share` times the distance of the
+            node's center the node counts as a singular point. Returns the new state."""
             # The coefficients c[:15] of the moments, and c[15] = E (`node_records`).
             c, inverse = node.payload, node.inverse
             error = c[15] * self._decay(inverse)
             slope = error * inverse
             # Its terms; where it is far; 1/r; the factor A + K/r^2 of the remainder; truncation
             # errors of value, gradient and Hessian, the latter two without their constant ratios;
-            # the radius of a ball around x that is free of its sources; the rounding.
+            # the distance at which it counts as a singular point; the rounding.
             sums = SourceSums.from_state(state[0]).add_far_node(
                 multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
                 inverse,
                 dr.fma(node.head[5], inverse * inverse, node.head[4]),
                 (error, slope, slope * inverse),
-                free_fraction * (node.square * inverse),
+                singular_share * (node.square * inverse),
                 unit,
             )
             return sums.to_state(), state[1]

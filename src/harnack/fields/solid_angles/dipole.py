@@ -191,7 +191,7 @@ class DipoleTree:
         # Where the field of a single point dominates, shading uses that point's normal. It is
         # reversed, because gradients point inwards: f is larger inside.
         area = dr.norm(nearest_moment)
-        # singularity_distance: the distance of the nearest dipole.
+        # singularity_distance: the distance of the nearest dipole; of far nodes, about that.
         is_dominated = (
             sums.singularity_distance * sums.singularity_distance < _NEAR_SQUARE_PER_AREA * area
         ) & (area > 0)
