@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).resolve().parents[2] / "src" / "harnack"
+from harnack.enclosures.selection import ENCLOSURE_NAMES, choose_enclosures
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = ROOT / "src" / "harnack"
 FILES = sorted(SOURCE.rglob("*.py"))
 
 # Each room imports from itself and from the rooms before it.
@@ -233,3 +238,31 @@ def test_package_imports_backend_before_anything_that_may_load_drjit() -> None:
 )
 def test_the_order_of_rooms_is_seen(path: str, source: str, wrong: bool) -> None:
     assert bool(misplaced_imports(Path(path), source)) == wrong
+
+
+def test_every_name_of_enclosures_is_explained() -> None:
+    docstring = inspect.getdoc(choose_enclosures) or ""
+    guide = (ROOT / "docs/proofs.md").read_text(encoding="utf-8")
+    names = [f'"{name}"' for name in ENCLOSURE_NAMES]
+    assert [name for name in names if name not in docstring or f"`{name}`" not in guide] == []
+
+
+def test_names_and_files_in_contributing_exist() -> None:
+    """Files in backquotes are there, and define what is said to be in them."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    found = {
+        name: path
+        for name in re.findall(r"`([\w./]+\.(?:pyi?|md))`", text)
+        for folder in (ROOT, SOURCE, SOURCE.parent, ROOT / "scripts/site")
+        if (path := folder / name).exists()
+    }
+    assert set(re.findall(r"`([\w/]+/[\w.]+\.pyi?)`", text)) <= set(found)
+    pairs = re.findall(r"`(\w+)`[^`.;]{0,30}?\s(?:in|of)\s+`([\w./]+\.py)`", text)
+    absent = [
+        (name, file)
+        for name, file in pairs
+        if not re.search(
+            rf"(?m)^\s*(?:def |class )?{name}\b *[:(=]", found[file].read_text("utf-8")
+        )
+    ]
+    assert absent == []

@@ -2,8 +2,8 @@
 sampled point. They prove lengths of the ray on which f takes none of given values, the levels.
 
 This package exports what all proofs share. The classes of enclosures are in the modules
-of this package, and those that users name also in `harnack.proofs`. Those of the literature, which
-are there for comparison, are in `harnack.literature`.
+of this package, and those that users name also in `harnack.proofs`. Those of published
+methods, which are there for comparison, are in a package of their own, `literature`.
 """
 
 from __future__ import annotations

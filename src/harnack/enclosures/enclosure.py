@@ -152,7 +152,8 @@ class Enclosure(abc.ABC):
         cls, promise: Promise, value: Real, error: Real, slopes: SlopeRange
     ) -> Self | None:
         """Return the enclosure that this class proves from a promise (a proved bound of f near the
-        sample); None if it does not use promises of that kind.
+        sample); None if it does not use promises of that kind. Nothing else of f is known: no
+        second derivative along the path, for example.
 
         value: f at the sample.
         error: a bound of the error of this value.
