@@ -18,6 +18,8 @@ _SECONDS_BETWEEN_LINES = 5.0
 # What was finished within these first seconds (stored results, for example) does not count in the
 # estimate of the remaining time.
 _INSTANT_SECONDS = 0.5
+# The remaining time is estimated once this fraction is finished: before, preparations weigh most.
+_LEAST_DONE = 0.1
 
 
 class Progress(str):
@@ -126,6 +128,8 @@ class _TextLines:
         text = f"{self._name}: {progress}"
         if done is not None:
             # By what was finished after the first half second; if that is nothing, by all.
-            left = past * (1 - done) / (done - self._cached_fraction or done)
-            text = f"{progress} after {past:.0f} s, about {left:.0f} s left"
+            text = f"{progress} after {past:.0f} s"
+            computed = done - self._cached_fraction or done
+            if computed >= _LEAST_DONE:
+                text += f", about {past * (1 - done) / computed:.0f} s left"
         print(text, file=sys.stderr, flush=True)

@@ -163,6 +163,11 @@ def test_formulas_of_texts_are_traced_like_functions() -> None:
     assert np.isfinite(one.t).sum() > 20
 
 
+def test_parameters_of_a_function_are_refused_with_a_way_out() -> None:
+    with pytest.raises(TypeError, match=r"of formulas as text: .* or a function of w that returns"):
+        hk.expression(lambda x, y, z: x, parameters={"w": 1.0})
+
+
 def test_domain_and_level_are_checked() -> None:
     with pytest.raises(TypeError, match="must be a volume"):
         hk.expression(waves, domain="ball")  # type: ignore[arg-type]

@@ -109,6 +109,26 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
     assert found.values[side] == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.parametrize("degrees", [20.0, 45.0, 60.0, 80.0])
+def test_thin_places_at_acute_edges_are_told_from_thin_walls(degrees: float) -> None:
+    """A rim where walls meet at a slant was named as the thinnest wall, without a word."""
+    height = 10 * np.tan(np.radians(degrees))
+    ends = [[0, y, 0] for y in (0, 8)] + [[10, y, z] for y in (0, 8) for z in (0, height)]
+    wedge = trimesh.convex.convex_hull(np.array(ends, float)).subdivide_to_size(0.7)
+    found = hk.check_print(wedge, min_thickness=0.8).problems[0]
+    assert found.kind == "thin walls"
+    assert "; all at edges with an acute angle, where any part is thin" in found.message
+    plate = trimesh.creation.box((6.0, 6.0, 0.3)).subdivide_to_size(0.7)
+    plate.apply_translation((30.0, 0.0, 0.0))
+    alone = hk.check_print(plate, min_thickness=0.8).problems[0]
+    assert "acute" not in alone.message
+    both = hk.check_print(trimesh.util.concatenate([wedge, plate]), min_thickness=0.8).problems[0]
+    assert both.count == found.count + alone.count
+    assert f"; {found.count:,} at edges with an acute angle" in both.message
+    assert "the thinnest elsewhere is 0.3, such as at (" in both.message
+    assert (both.locations[: alone.count, 0] > 20).all()
+
+
 def test_thickness_of_a_solid_is_that_of_its_mesh() -> None:
     shell = hk.Sphere(1.0) - hk.Sphere(0.8)
     found = hk.printing.wall_thickness(shell, tolerance=4e-3)

@@ -28,6 +28,18 @@ def test_notebooks_get_text_without_ipywidgets(
     assert capsys.readouterr().err == "rendering: 25% after 0 s, about 0 s left\n"
 
 
+def test_no_time_is_estimated_from_the_first_few_percent(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A task that compiles first was said to take several times as long as it did."""
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.0)
+    with progress.show_progress("page", progress=True) as reporter:
+        reporter.advance(0.05)
+        reporter.advance(0.15)
+    told = ["page: 5% after 0 s", "page: 20% after 0 s, about 0 s left"]
+    assert capsys.readouterr().err.splitlines() == told
+
+
 def test_short_tasks_write_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     finish_two_parts()
     assert capsys.readouterr() == ("", "")

@@ -22,7 +22,7 @@ from harnack.live.live_scene import LIVE_MODES
 from harnack.live.sliders import Slider
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import option_text as text
-from harnack.rendering.option_table import Option, options_of
+from harnack.rendering.option_table import NAMES_ELSEWHERE, Option, options_of
 
 _MESH_FILE = "a mesh: .stl, .obj, .ply, .off, .glb, .gltf or .3mf"
 _GROUP_TITLES = {
@@ -52,6 +52,11 @@ class _Parser(argparse.ArgumentParser):
     def options(self) -> list[str]:
         """Return the names of all options of this parser as they are written, such as "--level"."""
         return [name for action in self._actions for name in action.option_strings]
+
+    def positionals(self) -> list[str]:
+        """Return the names of all arguments of this parser that are no options, such as
+        "source"."""
+        return [action.dest for action in self._actions if not action.option_strings]
 
 
 class _Once(argparse.Action):
@@ -93,9 +98,33 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         known = command.options()
         if unknown[0] in known:  # behind "--"
             command.error(f"{text.quoted(unknown[0])} is an option: write it before --")
-        problem = "there is no option" if unknown[0].startswith("-") else "there is no use for"
-        command.error(f"{problem} {text.quoted(unknown[0])}{did_you_mean(unknown[0], known)}")
+        is_option = unknown[0].startswith("-")
+        command.error(_no_option(unknown[0], known) if is_option else _no_use(unknown[0], command))
     return namespace
+
+
+def _no_option(written: str, known: Sequence[str]) -> str:
+    """Return the message about an option that a command does not have.
+
+    written: the option as it was written, such as "--domain" or "--domain=ball:0,0,0,1".
+    known: the names of the command's options.
+    """
+    name = written.partition("=")[0]
+    other_name = NAMES_ELSEWHERE.get(name.lstrip("-").replace("-", "_").lower(), "")
+    flag = f"--{other_name.replace('_', '-')}"
+    hint = f'; did you mean "{flag}"?' if flag in known else did_you_mean(name, known)
+    return f"there is no option {text.quoted(name)}{hint}"
+
+
+def _no_use(written: str, command: _Parser) -> str:
+    """Return the message about an argument that is no option, and one too many for a command."""
+    problem = f"there is no use for {text.quoted(written)}"
+    if "source" not in command.positionals():
+        return f"{problem}{did_you_mean(written, command.options())}"
+    return (
+        f"{problem}: one scene, file or formula at a time, a formula in quotes; "
+        "`harnack gallery A B` draws several scenes"
+    )
 
 
 def parsers() -> tuple[_Parser, dict[str, _Parser]]:
@@ -409,7 +438,12 @@ def _parse_parameter(value: str) -> tuple[str, float]:
     name, equals, number = value.partition("=")
     if not equals or not name.strip().isidentifier():
         raise ValueError(f"{text.quoted(value)}: write a name and a number as a=0.5")
-    return name.strip(), text.parse_level(number)
+    if "=" in number:
+        raise ValueError(
+            f"{text.quoted(value)}: write --parameter once for each name, as --parameter a=0.5 "
+            "--parameter b=1"
+        )
+    return name.strip(), text.parse_level(number, "number")
 
 
 def _parse_slider(value: str) -> tuple[str, Slider]:
@@ -418,13 +452,18 @@ def _parse_slider(value: str) -> tuple[str, Slider]:
     ValueError for any other text."""
     name, _, interval_text = value.partition("=")
     name = name.strip().replace("-", "_")
+    if "=" in interval_text:
+        raise ValueError(
+            f"{text.quoted(value)}: write --slider once for each name, as --slider a=0:1 "
+            "--slider b=1:2"
+        )
     numbers = interval_text.split(":")
     if not name.isidentifier() or len(numbers) not in (2, 3):
         raise ValueError(
             f"{text.quoted(value)}: write a name and two ends as level=1:12, a step behind them as "
             "level=1:12:0.5"
         )
-    low, high, *step = map(text.parse_level, numbers)
+    low, high, *step = (text.parse_level(number, "number") for number in numbers)
     try:
         return name, Slider(low, high, step=step[0] if step else None)
     except ValueError as wrong:

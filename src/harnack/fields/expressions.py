@@ -352,7 +352,8 @@ def expression(
     level: float = 0.0,
     is_convex: bool = False,
 ) -> Expression:
-    """The implicit surface f(x, y, z) = level of a user's own formula, as a field.
+    """The implicit surface f(x, y, z) = level of a user's own formula, as a field. The formula is a
+    Python function or a text; a text may have parameters, numbers by name.
 
     function: a Python function of three coordinates. It is written with + - * / **, abs, and the
         functions of `harnack.math`: `sin`, `cos`, `tan`, `exp`, `log`, `sqrt`, `tanh`, `atan`,
@@ -360,7 +361,8 @@ def expression(
         the same names work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and
         minimum are `max` and `min`; an equation means left - right.
     parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a"; None for
-        no parameters.
+        no parameters. A Python function takes none: its numbers are those of the function around
+        it, such as `def cylinder(a): return hk.expression(lambda x, y, z: x**2 + y**2 - a)`.
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
     level: the level that is drawn by default.
@@ -381,7 +383,12 @@ def expression(
     if isinstance(function, str):
         function = TextFormula.parse(function, parameters)
     elif parameters:
-        raise TypeError("parameters are of formulas as text: a Python function has its own numbers")
+        name = next(iter(parameters))
+        raise TypeError(
+            "parameters are of formulas as text: a Python function has its own numbers. Write the "
+            f"formula as a text, or a function of {name} that returns hk.expression(lambda x, y, "
+            "z: ...)"
+        )
     if not callable(function):
         raise TypeError(
             "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "

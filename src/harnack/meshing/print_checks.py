@@ -117,7 +117,9 @@ def check_print(
     - vertices where sheets touch, and corners and edges that lie on other faces;
     - triangles that pass through each other or lie on each other (decided exactly), and duplicate
       faces;
-    - walls thinner than `min_thickness`, and a size that does not fit into `build_volume`.
+    - walls thinner than `min_thickness`, and a size that does not fit into `build_volume`. Edges
+      with an acute angle count as thin, too; the message says how many places lie there, and they
+      come last in `locations`.
 
     Hints are: corners that only rounding separates from others (they count as one), faces without
     an area, several parts, tiny parts, cavities without a way out (for powder and resin), a size
@@ -384,10 +386,20 @@ def _thin_walls(x: FloatArray, faces: IntArray, wall: float, is_solid: bool) -> 
         message = "how thick walls are is not known before the rest is mended"
         return PrintProblem("walls not measured", 1, np.zeros((0, 3)), message)
     thickness = wall_thickness(MeshSolid(x, faces))
-    locations = thickness.thin_locations(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
+    is_thin = thickness.is_thinner(wall - _ROUNDING * float(np.ptp(x, axis=0).max()))
+    is_acute = is_thin & thickness.is_at_acute_edge()
     suffix = f"; the thinnest is {thickness.thinnest:.3g}"
+    if is_acute.any():
+        is_elsewhere = is_thin & ~is_acute
+        which = f"{is_acute.sum():,}" if is_elsewhere.any() else "all"
+        suffix += f"; {which} at edges with an acute angle, where any part is thin"
+        if is_elsewhere.any():
+            suffix += f", the thinnest elsewhere is {thickness.values[is_elsewhere].min():.3g}"
     text = f"at {{}} {{triangle|triangles}} the part is thinner than {wall:g}{suffix}"
-    return _problem("thin walls", locations, text)
+    # Walls that are thin by themselves come first, then the thinnest.
+    rows = np.flatnonzero(is_thin)
+    rows = rows[np.lexsort((thickness.values[rows], is_acute[rows]))]
+    return _problem("thin walls", x[faces[rows]].mean(axis=1), text)
 
 
 def _coarse_faces(x: FloatArray, faces: IntArray, wall: float) -> PrintProblem:

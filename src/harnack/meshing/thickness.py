@@ -13,7 +13,16 @@ import numpy as np
 from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solids.mesh_solid import MeshSolid, solid_of_mesh
-from harnack.geometry.mesh_edges import area_normals, row_dots, row_norms
+from harnack.geometry.mesh_edges import (
+    Edges,
+    area_normals,
+    half_edges,
+    has_distinct_corners,
+    row_dots,
+    row_norms,
+    unit_normals,
+)
+from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.mesh_pipeline import mesh
 from harnack.tracer import trace
 
@@ -30,6 +39,15 @@ _MOST_ROUNDS, _TOUCHING = 30, 1e-6
 # Two points are opposite if the cosine between their normals is below this: walls beside an edge of
 # a part, at up to 120 degrees, are no thin places.
 _OPPOSITE = -0.5
+# An edge is acute if the cosine between the normals of its faces is below this, so that the angle
+# in the material is less than 87 degrees: not the edges of a box, but for rounding.
+_ACUTE = -0.05
+# Beside an edge of angle a, material is 2 d tan(a/2) thick at the distance d. A place belongs to
+# the edge up to this many times that distance, as walls may be curved; and a tangent of a/2 below
+# the second number counts as that.
+_REACH, _LEAST_TANGENT = 1.5, 0.05
+# So many acute edges, those with the nearest middles, are looked at for each face.
+_NEAR_EDGES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +80,32 @@ class WallThickness:
     def is_thinner(self, than: float) -> BoolArray:
         """(m,) whether the wall is thinner than `than`, a length, at each face."""
         return np.asarray(np.nan_to_num(self.values, nan=np.inf) < than)
+
+    def is_at_acute_edge(self) -> BoolArray:
+        """(m,) whether each face is thin because it lies beside an edge with an acute angle, as
+        where a wall is cut at a slant: any part is thin there, and its thickness goes to 0 at the
+        edge.
+
+        Let a < 87 degrees be the angle of the edge in the material. At the distance d from it the
+        material is 2 d tan(a/2) thick. A face counts if d is at most 1.5 times that distance for
+        its thickness. (A tangent below 0.05 counts as 0.05.)
+        """
+        result = np.zeros(len(self.faces), np.bool_)
+        ends, tangents = _acute_edges(self.vertices, self.faces)
+        rows = np.flatnonzero(np.isfinite(self.values))
+        if not len(ends):
+            return result
+        centers = self.vertices[self.faces[rows]].mean(axis=1)
+        limits = 0.5 * _REACH * self.values[rows]
+        count = min(_NEAR_EDGES, len(ends))
+        _, nearest = kd_tree(ends.mean(axis=1)).query(centers, k=[*range(1, count + 1)])
+        for k in range(count):
+            start, edge = ends[nearest[:, k], 0], ends[nearest[:, k], 1] - ends[nearest[:, k], 0]
+            fraction = row_dots(centers - start, edge) / row_dots(edge, edge)
+            foot = start + np.clip(fraction, 0, 1)[:, None] * edge
+            distance = row_norms(centers - foot)
+            result[rows] |= distance * tangents[nearest[:, k]] <= limits
+        return result
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
         """The mesh with a color for each face, by its thickness: red up to the thickness `low`,
@@ -98,9 +142,11 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
     approximation using nearest neighbors and the normal field). The thickness is the diameter of
     the last ball. Where walls are parallel it is their distance, and it is never more than t.
 
-    Near an edge of the part the adjacent wall is near, but not opposite. It does not count, so
-    edges are not reported as thin: the ball stops shrinking there, and the value is an upper bound
-    of the thickness. The value of a face without an area is NaN.
+    Near an edge with a right or obtuse angle the adjacent wall is near, but not opposite. It does
+    not count, so such edges are not reported as thin: the ball stops shrinking there, and the value
+    is an upper bound of the thickness. At an edge with an acute angle the ray meets the adjacent
+    wall, and thickness goes to 0 (`WallThickness.is_at_acute_edge`). The value of a face without an
+    area is NaN.
 
     Distances from the triangles are computed up to 1e-6 of the mesh's size. The thickness is
     measured only at the centers of faces: divide large faces first to measure it more densely
@@ -126,6 +172,28 @@ def wall_thickness(part: Any, **options: Any) -> WallThickness:
         solid, corner[rows].mean(axis=1), normal[rows] / length[rows, None]
     )
     return WallThickness(x, faces, values)
+
+
+def _acute_edges(x: FloatArray, faces: IntArray) -> tuple[FloatArray, FloatArray]:
+    """The edges of a closed mesh at which the angle a in the material is acute.
+
+    Returns:
+        The ends (k, 2, 3) of the edges; and for each the tangent (k,) of a/2, at least 0.05.
+    """
+    faces = faces[has_distinct_corners(faces)]
+    pairs = half_edges(faces)
+    first, second = Edges.of(pairs).paired_half_edges().T
+    normal, count = unit_normals(x[faces]), len(faces)
+    # Half-edge k m + i is that of face i from corner k, and the corner opposite is k + 2.
+    opposite = faces[second % count, (second // count + 2) % 3]
+    normals = normal[first % count], normal[second % count]
+    cosine = row_dots(*normals)
+    is_convex = row_dots(x[opposite] - x[pairs[first, 0]], normals[0]) < 0
+    is_acute = is_convex & (cosine < _ACUTE)
+    # The normals are at an angle of pi - a.
+    cosine = cosine[is_acute]
+    tangents = np.sqrt(np.maximum(1 + cosine, 0) / (1 - cosine))
+    return x[pairs[first[is_acute]]], np.maximum(tangents, _LEAST_TANGENT)
 
 
 def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -> FloatArray:

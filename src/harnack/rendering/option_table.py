@@ -260,12 +260,15 @@ OPTIONS: tuple[Option, ...] = (
 
 BY_NAME: Mapping[str, Option] = {option.name: option for option in OPTIONS}
 
-# Names in other programs, and what is called so here.
-_OTHER_PROGRAMS_NAMES = {
-    "color": '"material"', "colour": '"material"', "bsdf": '"material"', "samples": '"spp"',
-    "resolution": '"size"', "width": '"size"', "height": '"size"', "bound": '"enclosures"',
-    "filename": '"path", the second argument', "output": '"path", the second argument',
-    "file": '"path", the second argument', "domain": '"clip"', "solid": '"side"',
+NAMES_ELSEWHERE: Mapping[str, str] = {
+    "color": "material", "colour": "material", "bsdf": "material", "samples": "spp",
+    "resolution": "size", "width": "size", "height": "size", "bound": "enclosures",
+    "domain": "clip", "solid": "side",
+}  # fmt: skip
+"""Names in other programs and of arguments of fields, and the option that does the same here."""
+# Such names of what is no option.
+_ARGUMENTS_ELSEWHERE = {
+    **dict.fromkeys(("filename", "output", "file"), '"path", the second argument'),
     **dict.fromkeys(
         ("azimuth", "elevation", "fov", "zoom", "position", "target", "distance"),
         "camera=harnack.Camera(...), which has it",
@@ -348,7 +351,8 @@ def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     for name in keywords:
         if name not in BY_NAME:
             names = [option.name for option in options_of(verb)]
-            other_name = _OTHER_PROGRAMS_NAMES.get(name.lower())
+            option = NAMES_ELSEWHERE.get(name.lower())
+            other_name = f'"{option}"' if option else _ARGUMENTS_ELSEWHERE.get(name.lower())
             hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, names)
             raise TypeError(
                 f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(names)}"

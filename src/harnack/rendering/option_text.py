@@ -92,9 +92,12 @@ def parse_port(text: str) -> int:
     return int(text)
 
 
-def parse_level(text: str) -> float:
+def parse_level(text: str, kind: str = "level") -> float:
     """Return the level (value of the field) that a text holds: a finite number, or a multiple of pi
-    such as "2pi", "1.5*pi" or "-pi/2"."""
+    such as "2pi", "1.5*pi" or "-pi/2".
+
+    kind: what a message calls the text: another number may be written in the same way.
+    """
     # A factor, pi and a divisor; each of them may be missing.
     match = re.fullmatch(
         r"([+-]?[\d.]*(?:e[+-]?\d+)?)\s*\*?\s*(pi)?\s*(?:/\s*([\d.]+))?", text.strip()
@@ -113,7 +116,7 @@ def parse_level(text: str) -> float:
             raise ValueError
         return level
     except (ValueError, ZeroDivisionError):
-        raise ValueError(f"{quoted(text)} is no level; write 0.5, 2pi or pi/3") from None
+        raise ValueError(f"{quoted(text)} is no {kind}; write 0.5, 2pi or pi/3") from None
 
 
 def parse_levels(text: str) -> float | list[float]:
@@ -129,7 +132,7 @@ def parse_range(text: str) -> tuple[float, float]:
     low, colon, high = text.partition(":")
     if not colon:
         raise ValueError(f"{quoted(text)}: write two values as -0.3:0.3")
-    ends = parse_level(low), parse_level(high)
+    ends = parse_level(low, "number"), parse_level(high, "number")
     if not ends[0] < ends[1]:
         raise ValueError(f"{quoted(text)}: the first value must be the lower one")
     return ends

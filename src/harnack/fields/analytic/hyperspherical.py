@@ -126,12 +126,12 @@ class HypersphericalHarmonic(Field):
     """A harmonic function of the sphere S^3, the unit sphere of R^4, mapped to space: f(p) = P(y,
     w) at the point y = 2p/(1 + |p|^2), w = (|p|^2 - 1)/(1 + |p|^2) of S^3. P is a homogeneous
     harmonic polynomial of degree l of R^4; by default it is P_ljm(X) = N S_jm(y) |X|^(l-j)
-    C_(l-j)^(j+1)(w/|X|) with X = (y, w).
+    C_(l-j)^(j+1)(w/|X|) with X = (y, w). S_jm is the solid harmonic of `SphericalHarmonic`, C is a
+    Gegenbauer polynomial, and N is such that the integral of P^2 over S^3 is 1.
 
-    S_jm is the solid harmonic of `SphericalHarmonic`, C is a Gegenbauer polynomial, and N is such
-    that the integral of P^2 over S^3 is 1. The origin of space is the point w = -1 of S^3, the unit
-    sphere is w = 0, and far away f tends to the value at w = 1, which is 0 for j > 0. No level set
-    needs to be clipped: rays that leave are proved to meet nothing.
+    The origin of space is the point w = -1 of S^3, the unit sphere is w = 0, and far away f tends
+    to the value at w = 1, which is 0 for j > 0. No level set needs to be clipped: rays that leave
+    are proved to meet nothing.
 
     l, j, m: degree 0 <= l <= 6, and 0 <= j <= l, -j <= m <= j: (l+1)^2 functions for each l. For
         more general functions see `from_polynomial`.

@@ -52,14 +52,14 @@ _MIN_BOUND = 1e-20
 
 class Lobes(Field):
     """The surface |x| = scale |Y(x/|x|)| of a function Y on the unit sphere, a real spherical
-    harmonic or a sum of these; or only its lobes of one sign of Y. With r = |x|/scale and u =
+    harmonic (as in `SphericalHarmonic`: orthonormal, without the Condon-Shortley phase, of a degree
+    up to 12) or a sum of these; or only its lobes of one sign of Y. With r = |x|/scale and u =
     x/|x|, the field is f = r^2 (r^2 - Y(u)^2) for both signs, and f = r^2 (r - Y(u)) or r^2 (r +
     Y(u)) for the lobes where Y is positive or negative. The lobes are the points with f <= 0.
 
-    Y is as in `SphericalHarmonic`: orthonormal, without the Condon-Shortley phase, m > 0 with cos(m
-    phi) and m < 0 with sin(|m| phi). The factor r^2 makes second derivatives bounded at the origin,
-    where all lobes meet: f and its gradient vanish there, and the origin belongs to the surface. To
-    distinguish signs by color, draw both parts:
+    Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi). The factor r^2 makes second
+    derivatives bounded at the origin, where all lobes meet: f and its gradient vanish there, and
+    the origin belongs to the surface. To distinguish signs by color, draw both parts:
 
         lobes, signs = hk.fields.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, side="below")

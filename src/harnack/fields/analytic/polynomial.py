@@ -365,14 +365,13 @@ class _SolidHarmonics(Field):
 
 class SphericalHarmonic(_SolidHarmonics):
     """The solid harmonic (|p|/radius)^l Y_lm(p/|p|) of degree l and order m, a homogeneous harmonic
-    polynomial, in a ball. Y_lm is a real spherical harmonic: a function on the unit sphere.
+    polynomial, in a ball, for degrees up to 12. Y_lm is a real spherical harmonic, a function on
+    the unit sphere. It is orthonormal: the integral of Y_lm^2 over the sphere is 1. It is without
+    the Condon-Shortley phase: Y_11 is a positive multiple of x, Y_1-1 of y, Y_10 of z. Orders m > 0
+    contain cos(m phi), orders m < 0 contain sin(|m| phi).
 
     l, m: degree 0 <= l <= 12 and order -l <= m <= l.
     radius: the radius of the ball about the origin to which it is clipped.
-
-    Y_lm is orthonormal: the integral of Y_lm^2 over the unit sphere is 1. It is without the
-    Condon-Shortley phase: Y_11 is a positive multiple of x, Y_1-1 of y, Y_10 of z. Orders m > 0
-    contain cos(m phi), orders m < 0 contain sin(|m| phi).
 
     Raises:
         ValueError: l or m outside these ranges, or a radius that is not positive.
