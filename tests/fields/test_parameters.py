@@ -272,6 +272,9 @@ def test_the_constructor_checks_what_is_exchanged() -> None:
         hk.Torus().blended(hk.Cylinder(0.2), 0.3).replace(power=0.5)
     with pytest.raises(ValueError, match="the matrix is singular"):
         hk.Torus().scaled(2.0).replace(**{"map.matrix": np.zeros((3, 3))})
+    for field in (hk.Gyroid(), hk.expression("x"), hk.HarmonicPolynomial({(1, 0, 0): 1.0})):
+        with pytest.raises(TypeError, match=r"domain must be a volume: .*, not 3"):
+            field.replace(domain=3)
     formula = hk.expression("x^2 + a*y = 1", parameters={"a": 1.0})
     with pytest.raises(ValueError, match="a must be"):
         formula.replace(**{"function.parameters.a": math.nan})

@@ -122,9 +122,13 @@ class Field(Parametrized, abc.ABC):
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make a field, which remembers this call (`parameters`). Raises NotImplementedError for
-        arguments with derivatives enabled, unless the class has `has_parameter_derivatives`: their
-        derivatives would be lost."""
+        """Make a field, which remembers this call (`parameters`).
+
+        Raises:
+            NotImplementedError: arguments with derivatives enabled, which would be lost because the
+                class does not have `has_parameter_derivatives`.
+            TypeError: an argument `domain` that is neither a volume nor None.
+        """
         if not cls.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         field = super().__new__(cls)
