@@ -20,7 +20,7 @@ from harnack.field_from_file import field_from_file
 from harnack.files import FileFormatError
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.name_suggestions import did_you_mean
+from harnack.name_suggestions import did_you_mean, with_article
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, mitsuba_shape
 from harnack.rendering.option_table import OPTIONS
 
@@ -322,6 +322,22 @@ def test_names_that_begin_alike_are_preferred() -> None:
     assert did_you_mean("zzz", MATERIALS) == ""
     assert did_you_mean(3, MATERIALS) == ""
     assert did_you_mean("gold", []) == ""
+
+
+def test_beginnings_of_words_and_last_parts_are_similar() -> None:
+    assert did_you_mean("tol", ["total", "tolerance"]) == '; did you mean "total"?'
+    assert did_you_mean("tol", ["max_steps", "tolerance"]) == '; did you mean "tolerance"?'
+    assert did_you_mean("level", ["domain", "default_level"]) == '; did you mean "default_level"?'
+    assert did_you_mean("le", ["domain", "default_level"]) == ""
+    names = ["parts.0", "parts.0.parts", "parts.0.field.radius", "parts.1.field.radius"]
+    assert did_you_mean("parts.1.radius", names) == '; did you mean "parts.1.field.radius"?'
+
+
+def test_names_have_their_article() -> None:
+    names = "Sphere", "Expression", "Union", "HRBF", "AffineMap"
+    assert [*map(with_article, names)] == [
+        "a Sphere", "an Expression", "a Union", "an HRBF", "an AffineMap",
+    ]  # fmt: skip
 
 
 def test_lines_are_printable() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from harnack.backend.validation import check_no_derivatives
 from harnack.geometry.volume import Volume, check_volume
-from harnack.name_suggestions import did_you_mean
+from harnack.name_suggestions import did_you_mean, with_article
 
 if TYPE_CHECKING:
     from typing import Self
@@ -188,8 +188,8 @@ class Parametrized:
         for name, value in given.items():
             if value is _NOTHING:
                 raise TypeError(
-                    f"a {type(self).__name__} does not store the argument {name!r} of its "
-                    f"constructor: store it as an attribute {name!r}, or define "
+                    f"{with_article(type(self).__name__)} does not store the argument {name!r} "
+                    f"of its constructor: store it as an attribute {name!r}, or define "
                     "constructor_arguments()"
                 )
         make = getattr(type(self), call.maker) if call.maker else type(self)
@@ -212,7 +212,7 @@ class Parametrized:
                 listed = [*parameters][:_MAX_LISTED]
                 more = ", ..." if len(parameters) > _MAX_LISTED else ""
                 raise TypeError(
-                    f"a {type(self).__name__} has no parameter {name!r}"
+                    f"{with_article(type(self).__name__)} has no parameter {name!r}"
                     f"{did_you_mean(name, sorted(known))}; there are {', '.join(listed)}{more}"
                 )
 
