@@ -10,6 +10,7 @@ meant. Options that a verb does not have raise an error that names all of them.
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
@@ -106,7 +107,13 @@ class TraceOptions:
         """The tolerance as a `HitTolerance`; None if it follows the size of the surface."""
         if self.tolerance is None or isinstance(self.tolerance, HitTolerance):
             return self.tolerance
-        return HitTolerance(as_number(self.tolerance, "tolerance must be a length or HitTolerance"))
+        length = as_number(self.tolerance, "tolerance must be a length or HitTolerance")
+        if not 0 < length < math.inf:
+            raise ValueError(
+                f"tolerance must be finite and > 0, not {length!r}: a level set is never met "
+                "exactly"
+            )
+        return HitTolerance(length)
 
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
