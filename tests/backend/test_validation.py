@@ -97,7 +97,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
     "tolerance of options": (lambda: hk.TraceOptions(tolerance=ROW), "^tolerance must be a length"),
     "tolerance of a surface": (
         lambda: cast("Any", hk.Surface)(SPHERE, tolerance=1e-3),
-        "unexpected keyword argument 'tolerance'",
+        "Surface has no argument 'tolerance'; there are field, level",
     ),
     "a surface for a field": (
         lambda: hk.testing.check_field(hk.Surface(SPHERE)),

@@ -20,7 +20,7 @@ from harnack.field_from_file import field_from_file
 from harnack.files import FileFormatError
 from harnack.geometry import example_curves
 from harnack.geometry.example_meshes import icosphere
-from harnack.name_suggestions import did_you_mean
+from harnack.name_suggestions import did_you_mean, with_article
 from harnack.rendering import MATERIALS, UnboundedSurfaceError, mitsuba_shape
 from harnack.rendering.option_table import OPTIONS
 
@@ -82,6 +82,9 @@ def test_a_wrong_kind_of_argument_is_named(settings: dict[str, Any], complaint: 
         ({"up": "Y"}, r"up must be one of .* not 'Y'; did you mean \"y\"\?$"),
         ({"show": "normals"}, r"show must be one of .*; did you mean \"normal\"\?$"),
         ({"backdrop": "drak"}, r"backdrop must be one of .*; did you mean \"dark\"\?$"),
+        ({"tolerance": -1}, r"tolerance must be finite and > 0, not -1\.0"),
+        ({"tolerance": 0}, r"tolerance must be finite and > 0, not 0\.0"),
+        ({"enclosures": "paper"}, r'did you mean "classic"'),
         ({"enclosures": "Slop"}, r"unknown enclosures 'Slop'.*; did you mean \"slope\"\?$"),
         ({"side": "abov"}, r"side must be one of .*; did you mean \"above\"\?$"),
         ({"side": "between"}, r"between two levels, level=\(low, high\), and 1 are given"),
@@ -114,7 +117,7 @@ def test_a_picture_larger_than_memory_is_refused(monkeypatch: pytest.MonkeyPatch
         (lambda: hk.Surface(hk.Surface(POLYGON)), "Surface: take its .field"),  # pyright: ignore
         (lambda: hk.render([[POLYGON]]), "give one at a time, or to harnack.render one flat list"),
         (lambda: hk.render([KNOT]), "surfaces, not what is of type ndarray: of points"),
-        (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain of a Gyroid must be a"),  # pyright: ignore
+        (lambda: hk.trace(hk.Gyroid(1.0, domain="ball"), *RAY), "domain must be a volume"),  # pyright: ignore
         (lambda: hk.Ball(radius="2"), "radius of a ball must be a number, not '2'"),  # pyright: ignore
         (lambda: example_curves.torus_knot("2", 3, 60), "p of a torus knot must be a whole number"),  # pyright: ignore
         (lambda: hk.Isolines("z", levels="0.1"), "levels of isolines must be numbers"),
@@ -336,6 +339,24 @@ def test_names_that_begin_alike_are_preferred() -> None:
     assert did_you_mean("zzz", MATERIALS) == ""
     assert did_you_mean(3, MATERIALS) == ""
     assert did_you_mean("gold", []) == ""
+
+
+def test_beginnings_of_words_and_last_parts_are_similar() -> None:
+    assert did_you_mean("tol", ["total", "tolerance"]) == '; did you mean "total"?'
+    assert did_you_mean("tol", ["max_steps", "tolerance"]) == '; did you mean "tolerance"?'
+    assert did_you_mean("level", ["domain", "default_level"]) == '; did you mean "default_level"?'
+    assert did_you_mean("le", ["domain", "default_level"]) == ""
+    names = ["parts.0", "parts.0.parts", "parts.0.field.radius", "parts.1.field.radius"]
+    assert did_you_mean("parts.1.radius", names) == '; did you mean "parts.1.field.radius"?'
+
+
+def test_names_have_their_article() -> None:
+    names = "Sphere", "Expression", "Union", "HRBF", "AffineMap"
+    with pytest.raises(TypeError, match="an Expression is a function of space"):
+        _ = hk.expression("x") + 1
+    assert [*map(with_article, names)] == [
+        "a Sphere", "an Expression", "a Union", "an HRBF", "an AffineMap",
+    ]  # fmt: skip
 
 
 def test_lines_are_printable() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import warnings
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -173,6 +173,41 @@ def test_domain_and_level_are_checked() -> None:
         hk.expression(waves, domain="ball")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="level must be finite"):
         hk.expression(waves, level=math.nan)
+
+
+def test_an_exchanged_function_is_checked_as_a_new_one() -> None:
+    plane = hk.expression("x + 2*y", level=0.5)
+    turned = plane.replace(function="y + 2*x")
+    np.testing.assert_allclose(turned.value([[1.0, 0.0, 0.0]]), [2.0])
+    assert turned.default_level == 0.5
+    assert turned.replace(default_level=1.0).function(1.0, 0.0, 0.0) == 2.0
+    with pytest.raises(TypeError, match=r"function must be callable, .*, not 3"):
+        plane.replace(function=3)
+    with pytest.raises(TypeError, match="function must take three coordinates"):
+        plane.replace(function=lambda x: x)
+    with pytest.raises(ValueError, match="is no formula in x, y and z"):
+        plane.replace(function="x +")
+    cut = hk.expression("x + a", parameters={"a": 1.0})
+    with pytest.raises(TypeError, match=r"there is no 'parameters\.a' in the new value"):
+        cut.replace(**{"function": "x", "function.parameters.a": 2.0})
+    with pytest.raises(ValueError, match="level"):
+        plane.replace(default_level=math.nan)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: hk.Gyroid(1.0, domain=cast("Any", 3)),
+        lambda: hk.fields.HeightField(lambda x, y: x * y, cast("Any", "ball")),
+        lambda: hk.fields.HypersphericalHarmonic.from_polynomial(
+            {(1, 0, 0, 0): 1.0}, domain=cast("Any", 3)
+        ),
+        lambda: hk.HarmonicPolynomial({(1, 0, 0): 1.0}, domain=cast("Any", 3)),
+    ],
+)
+def test_every_domain_is_checked_when_the_field_is_made(make: Any) -> None:
+    with pytest.raises(TypeError, match="domain must be a volume: "):
+        make()
 
 
 def test_what_is_returned_must_be_a_number() -> None:

@@ -6,6 +6,7 @@ import copy
 import inspect
 import math
 import pickle
+import re
 from typing import Any
 
 import drjit as dr
@@ -267,6 +268,19 @@ def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
         both.replace(**{"parts.1.radios": 1.0})
     with pytest.raises(TypeError, match=r"has no parameter 'parts\.2'"):
         both.replace(**{"parts.2": hk.Sphere(0.8)})
+    moved = both | hk.Torus().translated((1.0, 0.0, 0.0))
+    for part, name in (
+        ("minor", "parts.2.field.minor"),
+        ("parts.2.minor", "parts.2.field.minor"),
+        ("center", "parts.1.center"),
+    ):
+        with pytest.raises(TypeError, match=f'did you mean "{re.escape(name)}"'):
+            moved.replace(**{part: 1.0})
+    text = hk.expression("x^2 + a*y = b", parameters={"a": 1.0, "b": 0.5})
+    with pytest.raises(TypeError, match=r'an Expression has .* mean "function\.parameters\.a"'):
+        text.replace(a=1.4)
+    with pytest.raises(TypeError, match='did you mean "default_level"'):
+        text.replace(level=0.2)
     with pytest.raises(TypeError, match='did you mean "domain"'):
         hk.Gyroid().replace(domian=_BALL)
 
@@ -278,6 +292,9 @@ def test_the_constructor_checks_what_is_exchanged() -> None:
         hk.Torus().blended(hk.Cylinder(0.2), 0.3).replace(power=0.5)
     with pytest.raises(ValueError, match="the matrix is singular"):
         hk.Torus().scaled(2.0).replace(**{"map.matrix": np.zeros((3, 3))})
+    for field in (hk.Gyroid(), hk.expression("x"), hk.HarmonicPolynomial({(1, 0, 0): 1.0})):
+        with pytest.raises(TypeError, match=r"domain must be a volume: .*, not 3"):
+            field.replace(domain=3)
     formula = hk.expression("x^2 + a*y = 1", parameters={"a": 1.0})
     with pytest.raises(ValueError, match="a must be"):
         formula.replace(**{"function.parameters.a": math.nan})

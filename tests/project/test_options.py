@@ -152,9 +152,45 @@ def test_unknown_names_get_a_hint() -> None:
         (lambda: hk.render(SPHERE, solid=(0, 1)), "side"),
         (lambda: hk.render(SPHERE, color="red"), "material"),
         (lambda: hk.mesh(SPHERE, tolerence=1.0), "tolerance"),
+        (lambda: hk.trace(SPHERE, *RAY, tol=1e-3), "tolerance"),
+        (lambda: hk.TraceOptions(tol=1e-3), "tolerance"),
+        (lambda: hk.TraceOptions().replace(steps=5), "max_steps"),
+        (lambda: hk.Surface(SPHERE, sides="below"), "side"),
+        (lambda: hk.Surface(SPHERE).replace(levl=5), "level"),
     ):
         with pytest.raises(TypeError, match=f'did you mean "{hint}"'):
             call()
+
+
+def test_unknown_names_get_the_list() -> None:
+    for call, names in (
+        (lambda: hk.trace(SPHERE, *RAY, zzz=1), "level, clip, section, largest, tolerance"),
+        (lambda: hk.TraceOptions(zzz=1), "tolerance, enclosures, max_steps"),
+        (lambda: hk.Surface(SPHERE).replace(zzz=1), "field, level, clip, section, side, largest"),
+    ):
+        with pytest.raises(TypeError, match=f"has no argument 'zzz'; .* {names}"):
+            call()
+
+
+def test_one_message_names_all_options_that_a_verb_lacks() -> None:
+    options = hk.TraceOptions(tolerance=1e-5, max_steps=9, precision="double")
+    solid = hk.Surface(SPHERE, side="below", largest=True)
+    point = [[1.0, 0.0, 0.0]]
+    wanted = (
+        r"curvature has no tolerance, max_steps, largest, side; of the options of surfaces and "
+        r"traces it has precision; give options\.replace\(tolerance=None, max_steps=2000\) and "
+        r'give surface\.replace\(largest=False, side="surface"\): faces of a solid'
+    )
+    with pytest.raises(TypeError, match=wanted):
+        hk.curvature(solid, point, options=options)
+    wanted = r"mesh has no max_steps, precision; .* give options\.replace\(max_steps=2000, precis"
+    with pytest.raises(TypeError, match=wanted):
+        hk.mesh(SPHERE, options=options)
+    left_out = r"signed_distance has no tolerance, side; .*; leave out tolerance, side$"
+    with pytest.raises(TypeError, match=left_out):
+        hk.signed_distance(SPHERE, point, tolerance=1.0, side="below", level=0.0)
+    with pytest.raises(TypeError, match=r"render has no frames: .* animate; no orbit: .* animate"):
+        hk.render(SPHERE, frames=3, orbit=3)
 
 
 # The command line.

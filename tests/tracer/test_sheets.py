@@ -1013,7 +1013,9 @@ def test_what_makes_no_sense_is_refused() -> None:
     solid = hk.Surface(field, level=0.5, side="above")
     with pytest.raises(ValueError, match="a field that jumps has no closed solid"):
         hk.render(solid, size=(8, 6), progress=False)
-    with pytest.raises(TypeError, match='trace has no side, and this is side="above"'):
+    with pytest.raises(
+        TypeError, match=r'trace has no side; .* give surface\.replace\(side="surface"\)'
+    ):
         hk.trace(solid, [[3.0, 0, 0]], [[-1.0, 0, 0]])
     field.period = 1.0  # type: ignore[misc]
     with pytest.raises(ValueError, match="must be real-valued"):

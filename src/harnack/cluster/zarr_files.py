@@ -16,6 +16,7 @@ from harnack.backend.validation import no_derivatives
 from harnack.cluster.dask_arrays import is_dask_array
 from harnack.cluster.serialization import import_cluster_package
 from harnack.cluster.workers import connect_client
+from harnack.name_suggestions import with_article
 from harnack.progress import ProgressFunction, show_progress
 
 # The attribute of a Zarr array that holds the name of the Dask array.
@@ -52,7 +53,7 @@ def to_zarr(
     zarr = import_cluster_package("zarr", "to_zarr")
     dask = import_cluster_package("dask", "to_zarr")
     if not is_dask_array(array):
-        raise TypeError(f"to_zarr writes a Dask array, not a {type(array).__name__}")
+        raise TypeError(f"to_zarr writes a Dask array, not {with_article(type(array).__name__)}")
     for lengths in array.chunks:
         if any(length != lengths[0] for length in lengths[:-1]) or lengths[-1] > lengths[0]:
             raise ValueError(

@@ -22,7 +22,7 @@ from harnack.distance.tangent_plane import first_order_distance, in_batches, sec
 from harnack.enclosures import Levels
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.field import Field
-from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.name_suggestions import did_you_mean, is_one_of, with_article
 from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer import TracedSurface, TraceOptions
 from harnack.tracer.surface import intersection_of
@@ -232,8 +232,9 @@ def _find(
     if surface.clip_volume is not None:
         if surface.field.jumps is not None:
             raise NotImplementedError(
-                f"{name} takes no clip and no section of a {type(surface.field).__name__}, which "
-                "jumps: cut its mesh by the volume, and give the winding number of that"
+                f"{name} takes no clip and no section of "
+                f"{with_article(type(surface.field).__name__)}, which jumps: cut its mesh "
+                "by the volume, and give the winding number of that"
             )
         # The search asks the field for its domain.
         field = copy.copy(surface.field)

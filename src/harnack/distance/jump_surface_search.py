@@ -25,6 +25,7 @@ from harnack.fields.capabilities import (
     NearestFacet,
     exactly_sampled,
 )
+from harnack.name_suggestions import with_article
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
@@ -261,7 +262,7 @@ def _jumps_of(surface: SurfaceTracer) -> Jumps:
         TypeError: f does not jump.
     """
     if surface.field.jumps is None:
-        raise TypeError(f"a {type(surface.field).__name__} does not jump")
+        raise TypeError(f"{with_article(type(surface.field).__name__)} does not jump")
     return surface.field.jumps
 
 

@@ -82,8 +82,10 @@ def curvature(
     points (n, 3).
 
     surface: a field, or a `Surface`. The curvature at a point is that of the level set through the
-        point, whatever its level is; levels, clip and section of a `Surface` have no effect.
-    options: a `TraceOptions`; curvatures use its `precision` alone. None is double precision.
+        point, whatever its level is; levels, clip and section of a `Surface` have no effect. One
+        with a side or `largest` raises a TypeError.
+    options: a `TraceOptions` in which only `precision` is set: any other option that is set raises
+        a TypeError. None is double precision.
     keywords: `precision`, in place of `options`.
 
     The derivative of n = grad f/|grad f| along a tangent u of the level set has the tangential
@@ -102,6 +104,7 @@ def curvature(
 
     Raises:
         NotImplementedError: the field has no second derivatives.
+        TypeError: an option that curvatures do not have.
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers.
     """
     target, choices = surface_and_options("curvature", surface, options, keywords, ("precision",))

@@ -57,6 +57,8 @@ _LITERATURE_CLASSES = {
     "interval": "IntervalEnclosure",
 }
 ENCLOSURE_NAMES = tuple(sorted((*_KINDS_BY_NAME, *_LITERATURE_CLASSES)))
+# What the published rule is called elsewhere, such as in lift_bound="paper", and its name here.
+_OTHER_NAMES: dict[str, str] = {"paper": "classic", "published": "classic", "harnack": "classic"}
 # Names of enclosures that need no promise: they are derived from ranges of a formula.
 _NAMES_USING_RANGES = [f'"{name}"' for name in ("pieces", *_LITERATURE_CLASSES)]
 
@@ -246,7 +248,7 @@ def _kinds_of_name(name: str) -> tuple[type[Enclosure], ...]:
     if name not in _KINDS_BY_NAME:
         raise ValueError(
             f"unknown enclosures {name!r}; choose one of {', '.join(ENCLOSURE_NAMES)}"
-            f"{did_you_mean(name, ENCLOSURE_NAMES)}"
+            f"{did_you_mean(_OTHER_NAMES.get(name.lower(), name), ENCLOSURE_NAMES)}"
         )
     return _KINDS_BY_NAME[name]
 

@@ -20,7 +20,6 @@ import numpy as np
 from harnack import arithmetic
 from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
-from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -324,16 +323,39 @@ class Expression(Formula):
     plain operators and the functions of `harnack.math`.
 
     function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
-        it become literals of that kernel.
+        it become literals of that kernel. A text is parsed to a `TextFormula`.
     domain: the volume in which f is drawn; None for all of space.
     default_level: the level that is drawn by default.
     is_convex: whether f is a convex function.
+
+    Raises:
+        The errors of `expression`.
     """
 
     function: Callable[[Any, Any, Any], Any]
     domain: Volume | None = None
     default_level: float = field(default=0.0, kw_only=True)
     is_convex: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check all arguments; `function` becomes a function if it is a text."""
+        function = cast("Any", self.function)
+        if isinstance(function, str):
+            function = TextFormula.parse(function)
+        if not callable(function):
+            raise TypeError(
+                "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "
+                f'"x * y = z", not {function!r}'
+            )
+        _check_arguments(function)
+        object.__setattr__(self, "function", function)  # the dataclass is frozen
+        object.__setattr__(self, "default_level", as_finite(self.default_level, "level"))
+        object.__setattr__(self, "is_convex", flag(self.is_convex, "is_convex"))
+        # Evaluate the formula once at an arbitrary point, as a test: this raises the errors that
+        # the docstring of `expression` names.
+        point = probe_jets()
+        value = as_jet(self.formula(*point), point[0], "expression")
+        check_no_derivatives("an expression", value)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.function(x, y, z)
@@ -389,19 +411,7 @@ def expression(
             f"formula as a text, or a function of {name} that returns hk.expression(lambda x, y, "
             "z: ...)"
         )
-    if not callable(function):
-        raise TypeError(
-            "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "
-            f'"x * y = z", not {function!r}'
-        )
-    _check_arguments(function)
-    check_volume(domain, "domain")
-    level, is_convex = as_finite(level, "level"), flag(is_convex, "is_convex")
     field = Expression(function, domain, default_level=level, is_convex=is_convex)
-    # Evaluate the formula once at an arbitrary point, as a test: this raises the errors that the
-    # docstring names.
-    point = probe_jets()
-    check_no_derivatives("an expression", as_jet(field.formula(*point), point[0], "expression"))
     warn_if_slow_to_compile(field)
     return field
 

@@ -35,6 +35,7 @@ from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, val
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.parameters import Parametrized, record_call
 from harnack.geometry.volume import check_volume
+from harnack.name_suggestions import with_article
 
 if TYPE_CHECKING:
     from typing import Self
@@ -122,9 +123,13 @@ class Field(Parametrized, abc.ABC):
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Make a field, which remembers this call (`parameters`). Raises NotImplementedError for
-        arguments with derivatives enabled, unless the class has `has_parameter_derivatives`: their
-        derivatives would be lost."""
+        """Make a field, which remembers this call (`parameters`).
+
+        Raises:
+            NotImplementedError: arguments with derivatives enabled, which would be lost because the
+                class does not have `has_parameter_derivatives`.
+            TypeError: an argument `domain` that is neither a volume nor None.
+        """
         if not cls.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         field = super().__new__(cls)
@@ -196,9 +201,9 @@ class Field(Parametrized, abc.ABC):
             TypeError: always.
         """
         raise TypeError(
-            f"a {type(self).__name__} is a function of space, which is not computed with as "
-            "numbers are: the level c of 2 f is the level c/2 of f, sums and products are written "
-            "as one formula, harnack.expression(lambda x, y, z: ...), and solids, which "
+            f"{with_article(type(self).__name__)} is a function of space, which is not computed "
+            "with as numbers are: the level c of 2 f is the level c/2 of f, sums and products are "
+            "written as one formula, harnack.expression(lambda x, y, z: ...), and solids, which "
             "harnack.solid makes of fields, are combined by |, & and -"
         )
 
@@ -524,24 +529,27 @@ def check_is_field(value: Any) -> None:
         raise TypeError(
             f"a harnack field is needed, such as harnack.Gyroid(1.0), not {suggest_field(value)}"
         )
-    check_volume(value.domain, f"the domain of a {type(value).__name__}")
+    check_volume(value.domain, f"the domain of {with_article(type(value).__name__)}")
 
 
 def suggest_field(value: Any) -> str:
     """The end of an error message about an object, `value`, that is given in place of a field: what
     kind of object it is, and how to make a field of it."""
     kind, name = type(value).__name__, getattr(value, "__name__", "")
+    object_of_kind = with_article(kind)
     # An object that holds a field, a list of fields, a class, a mesh, a text, points, or a
     # function.
     if isinstance(getattr(value, "field", None), Field):
-        return f"a {kind}: take its .field, and what else this takes of it, such as its level"
+        return (
+            f"{object_of_kind}: take its .field, and what else this takes of it, such as its level"
+        )
     parts: list[Any] = [*value] if type(value) in (list, tuple) else []
     if any(isinstance(part, Field) for part in parts):
-        return f"a {kind} of fields: give one at a time, or to harnack.render one flat list"
+        return f"{object_of_kind} of fields: give one at a time, or to harnack.render one flat list"
     if inspect.isclass(value) and issubclass(value, Field):
         return f"the class {name} itself: make one of it, {name}(...)"
     if hasattr(value, "vertices") and hasattr(value, "faces"):
-        return f"a {kind}: of a mesh, take harnack.WindingNumber(mesh.vertices, mesh.faces)"
+        return f"{object_of_kind}: of a mesh, take harnack.WindingNumber(mesh.vertices, mesh.faces)"
     if isinstance(value, str):
         return f"{value[:80]!r}: of a formula, take harnack.expression(text)"
     if isinstance(value, np.ndarray | list | tuple):

@@ -18,8 +18,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.validation import check_no_derivatives
-from harnack.geometry.volume import Volume
-from harnack.name_suggestions import did_you_mean
+from harnack.geometry.volume import Volume, check_volume
+from harnack.name_suggestions import did_you_mean, with_article
 
 if TYPE_CHECKING:
     from typing import Self
@@ -80,12 +80,16 @@ def _signature(kind: type, maker: str) -> inspect.Signature:
 def record_call(
     made: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], maker: str = ""
 ) -> None:
-    """Remember the call that makes an object, for `Parametrized.replace`.
+    """Remember the call that makes an object, for `Parametrized.replace`. An argument `domain` is
+    checked first, here for all classes.
 
     made: the object.
     args, kwargs: the arguments of the call. If these are no arguments of the maker, so that it is
         going to raise an error, nothing is remembered.
     maker: the name of the class method that is called; "" for the class itself.
+
+    Raises:
+        TypeError: the argument `domain` is neither a volume nor None.
     """
     signature = _signature(cast("Any", type(made)), maker)
     try:
@@ -96,6 +100,7 @@ def record_call(
         # The entries of **kwargs are arguments of their own.
         if parameter.kind is inspect.Parameter.VAR_KEYWORD:
             arguments |= arguments.pop(name, {})
+    check_volume(arguments.get("domain"), "domain")
     vars(made)["_constructor_call"] = ConstructorCall.of(maker, arguments)
 
 
@@ -183,8 +188,8 @@ class Parametrized:
         for name, value in given.items():
             if value is _NOTHING:
                 raise TypeError(
-                    f"a {type(self).__name__} does not store the argument {name!r} of its "
-                    f"constructor: store it as an attribute {name!r}, or define "
+                    f"{with_article(type(self).__name__)} does not store the argument {name!r} "
+                    f"of its constructor: store it as an attribute {name!r}, or define "
                     "constructor_arguments()"
                 )
         make = getattr(type(self), call.maker) if call.maker else type(self)
@@ -207,7 +212,7 @@ class Parametrized:
                 listed = [*parameters][:_MAX_LISTED]
                 more = ", ..." if len(parameters) > _MAX_LISTED else ""
                 raise TypeError(
-                    f"a {type(self).__name__} has no parameter {name!r}"
+                    f"{with_article(type(self).__name__)} has no parameter {name!r}"
                     f"{did_you_mean(name, sorted(known))}; there are {', '.join(listed)}{more}"
                 )
 
@@ -280,11 +285,16 @@ def _by_part(parts: Iterable[str], changes: Mapping[str, Any]) -> dict[str, dict
 
     Returns for each part in which something changes: the changes, by their names inside of it, such
     as "radius"; "" for the part itself.
+
+    Raises:
+        TypeError: a change is in none of the parts.
     """
     longest_first = sorted(parts, key=len, reverse=True)  # "1.5" before "1"
     found: dict[str, dict[str, Any]] = {}
     for changed, value in changes.items():
-        part = next(name for name in longest_first if f"{changed}.".startswith(f"{name}."))
+        part = next((name for name in longest_first if f"{changed}.".startswith(f"{name}.")), None)
+        if part is None:  # of a part that is exchanged as a whole, too, and has other names now
+            raise TypeError(f"there is no {changed!r} in the new value of what holds it")
         found.setdefault(part, {})[changed.removeprefix(part).removeprefix(".")] = value
     return found
 

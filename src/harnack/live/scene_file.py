@@ -49,7 +49,7 @@ from harnack.gallery import SCENES
 from harnack.geometry import Volume
 from harnack.live.sliders import SLIDER_OPTIONS, Slider
 from harnack.live.type_checks import check_types
-from harnack.name_suggestions import did_you_mean
+from harnack.name_suggestions import did_you_mean, with_article
 from harnack.rendering import Camera, Isolines
 from harnack.rendering.framing import rotation_to_z_up
 from harnack.rendering.option_table import BY_NAME, LIVE, LIVE_MODES, options_of
@@ -373,8 +373,9 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
         return {"curves": [np.asarray(loop).tolist() for loop in field.loops], **options}
     if type(field).__name__ not in _constructible_types():
         raise SceneFileError(
-            f"a {type(field).__name__} that was made in Python cannot be written into a scene "
-            "file, which holds curves, formulas, solids, surfaces of files and of the gallery"
+            f"{with_article(type(field).__name__)} that was made in Python cannot be written into "
+            "a scene file, which holds curves, formulas, solids, surfaces of files and of the "
+            "gallery"
         )
     # The field is read back to find out whether its arguments say all of it. It names no files.
     data = _object_to_json(field)
@@ -395,8 +396,10 @@ def _check_round_trip(field: Field, copy: Field) -> None:
     points = np.random.default_rng(0).normal(size=(256, 3))
     same = np.array_equal(field.value(points), copy.value(points), equal_nan=True)
     if not same or field.default_level != copy.default_level or field.domain != copy.domain:
-        raise SceneFileError(f"a {type(field).__name__} like this one cannot be written: its own "
-                             "arguments do not say all of it")  # fmt: skip
+        raise SceneFileError(
+            f"{with_article(type(field).__name__)} like this one cannot be written: its own "
+            "arguments do not say all of it"
+        )
 
 
 def _object_to_json(instance: Any) -> Plain:

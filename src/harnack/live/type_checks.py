@@ -13,6 +13,7 @@ import numpy as np
 
 from harnack.fields import Field
 from harnack.geometry import Volume
+from harnack.name_suggestions import with_article
 
 __all__ = ["ValueTypeError", "check_types"]
 
@@ -85,4 +86,4 @@ def _type_in_words(hint: Any) -> str:
             "" if origin is not tuple or Ellipsis in arguments else f"{len(arguments)} entries, "
         )
         return f"a list of {count}each {' or '.join(kinds)}"
-    return _WORDS.get(hint, f"a {getattr(hint, '__name__', hint)}")
+    return _WORDS.get(hint, with_article(getattr(hint, "__name__", str(hint))))

@@ -17,6 +17,7 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.triangle_mesh import TriangleMesh
+from harnack.name_suggestions import with_article
 
 __all__ = ["clip_to_volume", "snap_to_box"]
 
@@ -73,7 +74,9 @@ def clip_to_volume(surface: TriangleMesh, volume: Volume) -> TriangleMesh:
     if isinstance(volume, Ball):
         return _cut(surface, _ClipBoundary(np.array(volume.center), np.zeros(3), volume.radius))
     if not isinstance(volume, Box | HalfSpace | ConvexHull):
-        raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
+        raise MeshingError(
+            f"{with_article(type(volume).__name__)} cannot cut a mesh: give a box or a ball"
+        )
     # A row holds the plane's outward normal and its distance from the origin.
     for row in volume.planes():
         surface = _cut(surface, _ClipBoundary(row[:3] * row[3], row[:3], None))

@@ -15,6 +15,7 @@ from harnack.geometry.outline_loops import Outline, scale_for_clipper
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh
+from harnack.name_suggestions import with_article
 
 if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold
@@ -267,7 +268,9 @@ def volume_manifold(
         return manifold
     if isinstance(volume, Ball):
         return manifold ^ _ball_manifold(volume, tolerance)
-    raise MeshingError(f"a {type(volume).__name__} cannot cut a mesh: give a box or a ball")
+    raise MeshingError(
+        f"{with_article(type(volume).__name__)} cannot cut a mesh: give a box or a ball"
+    )
 
 
 def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:

@@ -81,6 +81,7 @@ from harnack.meshing.self_intersection_repair import resolve_self_intersections
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.meshing.tube_mesh import tube_manifold
+from harnack.name_suggestions import with_article
 from harnack.tracer.traced_surface import CallCache
 
 if TYPE_CHECKING:
@@ -632,8 +633,8 @@ class _DomainExtendedFunction(LevelFunction):
         if math.prod(high - low) < math.inf and domain.contains_points(points).all():
             return points
         raise MeshingError(
-            f"{type(self.field).__name__} ends at a {type(domain).__name__}, near which it cannot "
-            "be meshed: give the field a box or a ball as its domain"
+            f"{type(self.field).__name__} ends at {with_article(type(domain).__name__)}, near "
+            "which it cannot be meshed: give the field a box or a ball as its domain"
         )
 
 
@@ -707,7 +708,7 @@ def solid_value_range(field: Field, solid: Any, level: float | None) -> tuple[fl
     """
     if solid is True:
         raise ValueError(
-            f"a {type(field).__name__} has two sides: name the inside, by "
+            f"{with_article(type(field).__name__)} has two sides: name the inside, by "
             'side="below" or side="above"'
         )
     if level is not None:

@@ -365,11 +365,14 @@ def refuse_others(verb: str, keywords: Mapping[str, Any]) -> None:
 
     verb: the name of the function, such as "render".
     """
-    for name in keywords:
-        option = BY_NAME.get(name)
-        if option is not None and verb not in option.verbs:
-            verbs = ", ".join(sorted(option.verbs))
-            raise TypeError(f"{verb} has no {name}: that is an option of {verbs}")
+    others = [BY_NAME[name] for name in keywords if name in BY_NAME]
+    refused = [
+        f"no {option.name}: that is an option of {', '.join(sorted(option.verbs))}"
+        for option in others
+        if verb not in option.verbs
+    ]
+    if refused:
+        raise TypeError(f"{verb} has {'; '.join(refused)}")
 
 
 def shows_options(verb: str) -> Callable[[_Function], _Function]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from harnack.backend.validation import as_integer_in_range
 from harnack.fields import Field
-from harnack.name_suggestions import did_you_mean
+from harnack.name_suggestions import did_you_mean, with_article
 from harnack.rendering.aov_render import AOV_BACKGROUNDS, AOV_MODES, MODES_WITH_SCALE
 from harnack.rendering.backdrops import Backdrop, GradientBackdrop, GroundBackdrop, parse_backdrop
 from harnack.rendering.camera import Camera
@@ -310,7 +310,7 @@ def check_camera(camera: Any) -> Camera:
     except (TypeError, ValueError):
         raise TypeError(
             "camera must be a harnack.Camera, such as Camera(azimuth=-50, elevation=28), or the "
-            f"(x, y, z) where it stands, not a {type(camera).__name__} {camera!r}"
+            f"(x, y, z) where it stands, not {with_article(type(camera).__name__)} {camera!r}"
         ) from None
     return Camera(position=(x, y, z))
 

@@ -18,7 +18,7 @@ from harnack.backend.validation import check_no_derivatives
 from harnack.fields.field import check_is_field
 from harnack.geometry import VolumeIntersection
 from harnack.geometry.volume import check_volume
-from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.name_suggestions import did_you_mean, is_one_of, suggests_arguments
 from harnack.tracer.largest_component import validate_component_cells
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ class SurfaceKeywords(TypedDict, total=False):
     largest: bool | int
 
 
+@suggests_arguments
 @dataclass(frozen=True, init=False)
 class Surface:
     """The points at which a field f takes a level, or the boundary of the solid on one side of it.
@@ -113,7 +114,7 @@ class Surface:
 
     def replace(self, **changes: Any) -> Surface:
         """Return this surface with some arguments of its constructor changed. changes: new values
-        of arguments, by name."""
+        of arguments, by name. Raises the errors of the constructor."""
         arguments: dict[str, Any] = {"field": self.field, "level": self.levels, **self.keywords}
         arguments |= changes
         return Surface(**arguments)

@@ -4,19 +4,20 @@ module a verb is such a function.
 
 Beside a bare field, a verb takes the keywords of `Surface`; without `options`, it takes those of
 `TraceOptions`. Keywords beside an object that holds them raise an error, since either could be
-meant. An option that a verb does not have raises an error that names it.
+meant. Options that a verb does not have raise an error that names all of them.
 """
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from harnack.backend.validation import as_integer_in_range, flag
 from harnack.enclosures import EnclosureChoice, EnclosureKinds, choose_enclosures
-from harnack.name_suggestions import did_you_mean, is_one_of
+from harnack.name_suggestions import did_you_mean, is_one_of, suggests_arguments
 from harnack.tracer.level_contact import HitTolerance
 from harnack.tracer.surface import Surface, SurfaceKeywords, as_number
 
@@ -39,10 +40,13 @@ class TraceKeywords(SurfaceKeywords, total=False):
     require_crossing: bool
 
 
+@suggests_arguments
 @dataclass(frozen=True, kw_only=True)
 class TraceOptions:
     """How a surface is traced, drawn, meshed or measured: the `options` of every function that
-    takes a surface (`trace`, `render`, `mesh`, ...). f is the field whose level is the surface.
+    takes a surface (`trace`, `render`, `mesh`, ...). A function raises a TypeError for options that
+    it does not have, unless they have their defaults; docs/options.md says which it has. f is the
+    field whose level is the surface.
 
     tolerance: the largest distance of hits, of points of a picture or of triangles from the
         surface, a length in the field's coordinates; or a `HitTolerance`. None follows the size of
@@ -103,7 +107,13 @@ class TraceOptions:
         """The tolerance as a `HitTolerance`; None if it follows the size of the surface."""
         if self.tolerance is None or isinstance(self.tolerance, HitTolerance):
             return self.tolerance
-        return HitTolerance(as_number(self.tolerance, "tolerance must be a length or HitTolerance"))
+        length = as_number(self.tolerance, "tolerance must be a length or HitTolerance")
+        if not 0 < length < math.inf:
+            raise ValueError(
+                f"tolerance must be finite and > 0, not {length!r}: a level set is never met "
+                "exactly"
+            )
+        return HitTolerance(length)
 
     @property
     def enclosure_kinds(self) -> EnclosureKinds:
@@ -112,7 +122,8 @@ class TraceOptions:
         return choose_enclosures(self.enclosures)
 
     def replace(self, **changes: Any) -> TraceOptions:
-        """Return these options with some values changed, by name."""
+        """Return these options with some values changed, by name. Raises the errors of the
+        constructor."""
         return replace(self, **changes)
 
 
@@ -144,14 +155,15 @@ def surface_and_options(
             `TraceOptions` beside `options`; `surface` is neither a field nor a `Surface`.
         ValueError: a value that `Surface` or `TraceOptions` refuses.
     """
-    # First, keywords that the called function does not have.
     for name in keywords:
-        if name in (*SURFACE_OPTIONS, *TRACE_OPTIONS) and name not in honored:
-            raise TypeError(_refusal(verb, name, honored))
-        if name not in honored:
-            raise TypeError(f"{verb} has no argument {name!r}{did_you_mean(name, honored)}")
+        if name not in (*SURFACE_OPTIONS, *TRACE_OPTIONS):
+            raise TypeError(
+                f"{verb} has no argument {name!r}{did_you_mean(name, honored)}; "
+                f"{_list_of_honored(honored)}"
+            )
+    _refuse_not_honored(verb, surface, options, keywords, honored)
     surface_keywords = {name: value for name, value in keywords.items() if name in SURFACE_OPTIONS}
-    chosen_options = trace_options(verb, options, keywords, honored)
+    chosen_options = trace_options_among(options, keywords)
     if isinstance(surface, Surface):
         if surface_keywords:
             raise TypeError(
@@ -160,14 +172,6 @@ def surface_and_options(
             )
     else:
         surface = Surface(surface, **surface_keywords)
-    # A `Surface` may hold options that the called function does not have.
-    if "side" not in honored and surface.solid_range is not None:
-        raise TypeError(
-            f'{verb} has no side, and this is side="{surface.side}" of a level: faces of a solid '
-            'on its clip are no part of a level set; give surface.replace(side="surface")'
-        )
-    if "largest" not in honored and surface.largest:
-        raise TypeError(_refusal(verb, "largest", honored))
     return surface, chosen_options
 
 
@@ -183,19 +187,50 @@ def trace_options(
     Raises:
         TypeError: both are given; or an option is set that the called function does not have.
     """
-    choices = trace_options_among(options, keywords)
-    for option in fields(TraceOptions):
-        if option.name not in honored and getattr(choices, option.name) != option.default:
-            raise TypeError(_refusal(verb, option.name, honored))
-    return choices
+    _refuse_not_honored(verb, None, options, keywords, honored)
+    return trace_options_among(options, keywords)
 
 
-def _refusal(verb: str, name: str, honored: Sequence[str]) -> str:
-    """Return the text of the error for an option `name` that the called function `verb` does not
-    have. The text lists the options that the function has, `honored`."""
-    return (
-        f"{verb} has no {name}; of the options of surfaces and traces it has {', '.join(honored)}"
-    )
+def _refuse_not_honored(
+    verb: str, surface: Any, options: Any, keywords: Mapping[str, Any], honored: Sequence[str]
+) -> None:
+    """Raise TypeError if a called function does not have some of the options that are given as
+    keywords, or that are set in `options` or `surface`. One message names all of them, says what to
+    write in their place, and lists the options that the function has.
+
+    The arguments are those of `surface_and_options`.
+    """
+    refused, remedies = [name for name in keywords if name not in honored], list[str]()
+    if refused:
+        remedies.append(f"leave out {', '.join(refused)}")
+    set_options, of_surface = dict[str, str](), dict[str, str]()
+    if isinstance(options, TraceOptions):
+        set_options = {
+            option.name: repr(option.default)
+            for option in fields(TraceOptions)
+            if option.name not in honored and getattr(options, option.name) != option.default
+        }
+    if isinstance(surface, Surface):
+        if "largest" not in honored and surface.largest:
+            of_surface["largest"] = "False"
+        if "side" not in honored and surface.solid_range is not None:
+            of_surface["side"] = '"surface"'
+    for owner, defaults in (("options", set_options), ("surface", of_surface)):
+        if defaults:
+            changes = ", ".join(f"{name}={default}" for name, default in defaults.items())
+            remedies.append(f"give {owner}.replace({changes})")
+    refused += [name for name in (*set_options, *of_surface) if name not in refused]
+    if refused:
+        reason = ": faces of a solid on its clip are no part of a level set"
+        raise TypeError(
+            f"{verb} has no {', '.join(refused)}; {_list_of_honored(honored)}; "
+            f"{' and '.join(remedies)}{reason if 'side' in of_surface else ''}"
+        )
+
+
+def _list_of_honored(honored: Sequence[str]) -> str:
+    """Return the part of an error message that lists the options that a function has."""
+    return f"of the options of surfaces and traces it has {', '.join(honored)}"
 
 
 def trace_options_among(options: Any, keywords: Mapping[str, Any]) -> TraceOptions:

@@ -19,6 +19,7 @@ from harnack.backend import to_float
 from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
+from harnack.name_suggestions import with_article
 from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
 from harnack.tracer.surface import Surface, intersection_of, level_number, side_range
@@ -347,7 +348,8 @@ def check_has_inside(surface: TracedSurface) -> None:
         raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
     if field.patches is not None:
         raise ValueError(
-            f"a {type(field).__name__} is many surfaces and no closed solid: draw it without side"
+            f"{with_article(type(field).__name__)} is many surfaces and no closed solid: draw it "
+            "without side"
         )
     if field.jumps is not None:
         raise ValueError(

@@ -42,7 +42,6 @@ from harnack.fields.analytic.sphere_bounds import (
 from harnack.fields.field import Field, validate_levels_in_range
 from harnack.fields.parameters import record_call
 from harnack.geometry.clip_volumes import Ball
-from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -173,7 +172,6 @@ class HypersphericalHarmonic(Field):
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741
         """Check l, j and m, and set up the function with this single term."""
         l, j, m = integer(l, "the degree l"), integer(j, "j"), integer(m, "the order m")  # noqa: E741
-        check_volume(domain, "domain")
         if not 0 <= l <= LARGEST_DEGREE:
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if not 0 <= j <= l:

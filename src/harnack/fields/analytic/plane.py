@@ -44,7 +44,6 @@ from harnack.fields.analytic.branches import (
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
 from harnack.geometry.clip_volumes import Box, VolumeIntersection
-from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -468,10 +467,9 @@ class HeightField(Formula):
     domain: Volume | None = field(default_factory=_unit_box)
 
     def __post_init__(self) -> None:
-        """Check the function, by a call as a test, and the domain."""
+        """Check the function, by a call as a test, and that the domain is bounded."""
         if not callable(self.function):
             raise TypeError(f"function must be callable with x, y, not {self.function!r}")
-        check_volume(self.domain, "domain")
         if self.domain is None or not np.isfinite(self.domain.bounds()).all():
             raise ValueError(
                 "a height field needs a bounded domain, such as harnack.Ball() or "

@@ -41,7 +41,6 @@ from harnack.fields.blobs.blob_sums import (
 )
 from harnack.fields.formula import Formula, is_jet
 from harnack.geometry import Box
-from harnack.geometry.volume import check_volume
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,9 +79,8 @@ class HRBF(Formula):
     default_level: float = 0.0
 
     def __init__(self, points: Any, normals: Any, *, domain: Volume | None = None) -> None:
-        """Check points, normals and domain (see the class), and solve for the coefficients a_i and
+        """Check points and normals (see the class), and solve for the coefficients a_i and
         b_i of the function."""
-        check_volume(domain, "domain")
         self.points, self.normals = _checked(points, normals)
         self.value_coefficients, self.gradient_coefficients = _solve_coefficients(
             self.points, self.normals
