@@ -130,7 +130,7 @@ def validate_samples(
         name = f"{type(self).__name__}.evaluate"
         if not isinstance(sample, Sample):
             raise TypeError(
-                f"{name} returned {_describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
+                f"{name} returned {describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
             )
         # Both attributes must be tuples of promises.
         group: Any
@@ -140,18 +140,16 @@ def validate_samples(
         ):
             if not isinstance(group, tuple):
                 raise TypeError(
-                    f"{name}: Sample.{place} is {_describe_type(group)}, not a tuple: "
-                    f"{_SAMPLE_HELP}"
+                    f"{name}: Sample.{place} is {describe_type(group)}, not a tuple: {_SAMPLE_HELP}"
                 )
             for promise in cast("tuple[Any, ...]", group):
                 if not isinstance(promise, Promise):
-                    wrong = f"Sample.{place} holds {_describe_type(promise)}, no promise"
+                    wrong = f"Sample.{place} holds {describe_type(promise)}, no promise"
                     raise TypeError(f"{name}: {wrong}: {_SAMPLE_HELP}")
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
             raise TypeError(
-                f"{name}: Sample.gradient is {_describe_type(gradient)}, no 3-vector: "
-                f"{_SAMPLE_HELP}"
+                f"{name}: Sample.gradient is {describe_type(gradient)}, no 3-vector: {_SAMPLE_HELP}"
             )
         # Derivatives of the value that do not come from p would be lost.
         if not self.has_parameter_derivatives and not dr.grad_enabled(p):
@@ -170,7 +168,7 @@ def _unbox_numpy(record: _R) -> _R:
     return dataclasses.replace(record, **scalars) if scalars else record
 
 
-def _describe_type(value: Any) -> str:
+def describe_type(value: Any) -> str:
     """The type of a value in words, for error messages: "nothing" for None."""
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
 
