@@ -232,6 +232,20 @@ def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:
     assert hk.trace(Charge(), *RAY).is_hit.all()
 
 
+def test_numpy_in_evaluate_is_named() -> None:
+    """It was Dr.Jit's page about variables that remain dirty."""
+
+    class Own(Field):
+        domain = hk.Ball(radius=2.0)
+
+        def evaluate(self, p: Any) -> Sample:
+            r = type(p.x)(np.linalg.norm(np.array(p), axis=0))
+            return Sample(r - 1, p / r, (Lipschitz(1.0),))
+
+    with pytest.raises(TypeError, match=r"Own.evaluate asked for the numbers of p, as NumPy"):
+        hk.trace(Own(), *RAY)
+
+
 class Wrapped(hk.Field):
     """A field that holds others in a list, and uploads nothing itself."""
 

@@ -126,8 +126,18 @@ def validate_samples(
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
         """The sample at p that `evaluate` returns, after the checks of `validate_samples`."""
-        sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
+        try:
+            sample: Any = evaluate(self, p)
+        except RuntimeError as error:
+            # What Dr.Jit says of a number that is wanted while a loop is being recorded.
+            if "remains dirty" not in str(error):
+                raise
+            raise TypeError(
+                f"{name} asked for the numbers of p, as NumPy functions do: it is recorded as part "
+                "of a kernel, before there are numbers, so write it with functions of drjit, such "
+                "as dr.norm(p) and dr.select(mask, a, b)"
+            ) from error
         if not isinstance(sample, Sample):
             raise TypeError(
                 f"{name} returned {describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
