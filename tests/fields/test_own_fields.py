@@ -220,9 +220,30 @@ def test_enclosures_that_do_not_apply_name_those_that_do(
 
 
 def test_a_promise_is_needed_and_half_a_range_is_enough() -> None:
-    with pytest.raises(ValueError, match=r"Sample\.promises is empty.*Lipschitz"):
-        hk.trace(Bell(lambda w: (), 1.0, 2.0), *RAY)
+    silent, message = Bell(lambda w: (), 1.0, 2.0), r"Sample\.promises is empty.*Lipschitz"
+    with pytest.raises(ValueError, match=message) as raised:
+        hk.trace(silent, *RAY)
+    # Nothing is said of enclosures, which were not asked for, and of formulas.
+    assert str(raised.value).startswith("the field makes no promise")
+    assert "nclosure" not in str(raised.value)
+    assert "ormula" not in str(raised.value)
+    with pytest.raises(ValueError, match=r"^the enclosures asked for .*" + message):
+        hk.trace(silent, *RAY, enclosures="caps")
     assert hk.trace(Charge(), *RAY).is_hit.all()
+
+
+def test_numpy_in_evaluate_is_named() -> None:
+    """It was Dr.Jit's page about variables that remain dirty."""
+
+    class Own(Field):
+        domain = hk.Ball(radius=2.0)
+
+        def evaluate(self, p: Any) -> Sample:
+            r = type(p.x)(np.linalg.norm(np.array(p), axis=0))
+            return Sample(r - 1, p / r, (Lipschitz(1.0),))
+
+    with pytest.raises(TypeError, match=r"Own.evaluate asked for the numbers of p, as NumPy"):
+        hk.trace(Own(), *RAY)
 
 
 class Wrapped(hk.Field):

@@ -126,11 +126,21 @@ def validate_samples(
     @functools.wraps(evaluate)
     def checked(self: Any, p: Vec3) -> Sample:
         """The sample at p that `evaluate` returns, after the checks of `validate_samples`."""
-        sample: Any = evaluate(self, p)
         name = f"{type(self).__name__}.evaluate"
+        try:
+            sample: Any = evaluate(self, p)
+        except RuntimeError as error:
+            # What Dr.Jit says of a number that is wanted while a loop is being recorded.
+            if "remains dirty" not in str(error):
+                raise
+            raise TypeError(
+                f"{name} asked for the numbers of p, as NumPy functions do: it is recorded as part "
+                "of a kernel, before there are numbers, so write it with functions of drjit, such "
+                "as dr.norm(p) and dr.select(mask, a, b)"
+            ) from error
         if not isinstance(sample, Sample):
             raise TypeError(
-                f"{name} returned {_describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
+                f"{name} returned {describe_type(sample)}, not a Sample: {_SAMPLE_HELP}"
             )
         # Both attributes must be tuples of promises.
         group: Any
@@ -140,18 +150,16 @@ def validate_samples(
         ):
             if not isinstance(group, tuple):
                 raise TypeError(
-                    f"{name}: Sample.{place} is {_describe_type(group)}, not a tuple: "
-                    f"{_SAMPLE_HELP}"
+                    f"{name}: Sample.{place} is {describe_type(group)}, not a tuple: {_SAMPLE_HELP}"
                 )
             for promise in cast("tuple[Any, ...]", group):
                 if not isinstance(promise, Promise):
-                    wrong = f"Sample.{place} holds {_describe_type(promise)}, no promise"
+                    wrong = f"Sample.{place} holds {describe_type(promise)}, no promise"
                     raise TypeError(f"{name}: {wrong}: {_SAMPLE_HELP}")
         gradient: Any = sample.gradient
         if not dr.is_array_v(type(gradient)) or dr.size_v(type(gradient)) != 3:
             raise TypeError(
-                f"{name}: Sample.gradient is {_describe_type(gradient)}, no 3-vector: "
-                f"{_SAMPLE_HELP}"
+                f"{name}: Sample.gradient is {describe_type(gradient)}, no 3-vector: {_SAMPLE_HELP}"
             )
         # Derivatives of the value that do not come from p would be lost.
         if not self.has_parameter_derivatives and not dr.grad_enabled(p):
@@ -170,7 +178,7 @@ def _unbox_numpy(record: _R) -> _R:
     return dataclasses.replace(record, **scalars) if scalars else record
 
 
-def _describe_type(value: Any) -> str:
+def describe_type(value: Any) -> str:
     """The type of a value in words, for error messages: "nothing" for None."""
     return "nothing" if value is None else f"an object of type {type(value).__name__}"
 

@@ -154,9 +154,16 @@ class EnclosureKinds:
         requested = ", ".join(kind.__name__ for kind in self.kinds)
         if not promises:
             kinds = ", ".join(kind.__name__ for kind in Promise.__subclasses__())
+            message = (
+                "the field makes no promise, from which steps would be proved: Sample.promises is "
+                "empty, but evaluate must put at least one of the promises in harnack.proofs into "
+                f"it: {kinds}"
+            )
+            # What is used if the option is left out: nothing was asked for.
+            if not self.uses_alternative_promises:
+                return message
             return (
-                f"the enclosures asked for ({requested}) need a promise and the field makes none: "
-                f"Sample.promises is empty, return one of these in it: {kinds}. Formulas are "
+                f"the enclosures asked for ({requested}) need a promise: {message}. Formulas are "
                 "enclosed by ranges: leave enclosures out, or choose one of "
                 f"{', '.join(_NAMES_USING_RANGES)}"
             )

@@ -25,10 +25,13 @@ length about five times as long as the ranges of f in the published proof.
 from __future__ import annotations
 
 import abc
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from harnack.enclosures.samples import describe_type
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
@@ -112,7 +115,9 @@ class Jumps(abc.ABC):
 
     A field with jumps is real-valued (it has no period). Subclasses define two methods:
     `next_crossing` gives the next crossing of a ray, and `continuation` gives the field on the
-    interval between two crossings. Fields that count jumps also define `initial_offset`.
+    interval between two crossings. They also define `initial_offset` if `continuation` uses its
+    `offset`, unless f has no offset (0) at the start of every ray. `harnack.testing.check_field`
+    tests all three.
 
     These methods may be called while a loop is being recorded. Results on lanes that are not active
     are ignored.
@@ -120,6 +125,14 @@ class Jumps(abc.ABC):
 
     takes_all_levels: bool = False
     """Whether the field takes its levels only at its facets: see `are_whole_surface`."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Wrap the methods `next_crossing` and `continuation` of a new subclass, such that they
+        raise a TypeError if they return something of another type than they should."""
+        super().__init_subclass__(**kwargs)
+        for name, check in (("next_crossing", _check_crossing), ("continuation", _check_field)):
+            if name in vars(cls):
+                setattr(cls, name, _with_checked_result(vars(cls)[name], check))
 
     @abc.abstractmethod
     def next_crossing(
@@ -220,6 +233,40 @@ class Jumps(abc.ABC):
         (`takes_all_levels`). The default is False."""
         del levels
         return False
+
+
+def _with_checked_result(
+    method: Callable[..., Any], check: Callable[[str, Any], None]
+) -> Callable[..., Any]:
+    """The method of a `Jumps`, with its result passed to `check`, after a name for messages."""
+
+    @functools.wraps(method)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> Any:
+        """What the method returns, after the check."""
+        result = method(self, *args, **kwargs)
+        check(f"{type(self).__name__}.{method.__name__}", result)
+        return result
+
+    return checked
+
+
+def _check_crossing(name: str, result: Any) -> None:
+    """Raise TypeError unless the result of `Jumps.next_crossing` is a `JumpCrossing`."""
+    if not isinstance(result, JumpCrossing):
+        raise TypeError(
+            f"{name} returned {describe_type(result)}: return "
+            "harnack.fields.JumpCrossing(t, facet, jump, normal)"
+        )
+
+
+def _check_field(name: str, result: Any) -> None:
+    """Raise TypeError unless the result of `Jumps.continuation` is a field."""
+    # (What makes a field here are its samples: `fields.field` imports this file.)
+    if not callable(getattr(result, "sample_ray", None)):
+        raise TypeError(
+            f"{name} returned {describe_type(result)}: return a field, a harnack.Field whose "
+            "evaluate(p) gives f between the two crossings"
+        )
 
 
 class ModuloOne(abc.ABC):

@@ -32,9 +32,11 @@ from harnack.fields.batched_fields import BatchedField
 from harnack.fields.field import Field, check_is_field
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
+from harnack.testing.jump_contracts import check_jumps
 from harnack.testing.violation_search import (
     BrokenPromiseError,
     FieldSamples,
+    distance_to_exit,
     lift_along_rays,
     random_directions,
     random_points,
@@ -191,8 +193,14 @@ def check_field(
     - Near the branch points of a Riemann surface all branches are within the bounds that are stated
       there.
 
-    Jumps across facets are taken out along a ray. Values may in addition change between neighboring
-    points by `Sample.value_error`, as they do where a tree approximates other clusters as wholes.
+    - Of a field with `Jumps`: along rays, crossings of facets follow in order, whatever the start
+      of the search, with unit normals on the side where f is larger. Between crossings the
+      `continuation` has the values of f and keeps its own promises, and from one interval to the
+      next it changes by the jump.
+
+    Other checks take jumps across facets out along a ray. Values may in addition change between
+    neighboring points by `Sample.value_error`, as they do where a tree approximates other clusters
+    as wholes.
 
     The default takes one to three seconds for most fields, on two cores; for meshes about ten, for
     a `Morph` half a minute. It is a search and no proof: a promise that is wrong where nothing
@@ -201,7 +209,8 @@ def check_field(
     Raises:
         BrokenPromiseError: naming the promise and the point where it is broken.
         ValueError: none of the points lies in the field's domain.
-        TypeError: `evaluate` returns something else than a `Sample`.
+        TypeError: `evaluate` returns something else than a `Sample`; or a method of `Jumps`
+            something else than it should.
     """
     check_is_field(field)
     generator = np.random.default_rng(rng)
@@ -228,6 +237,8 @@ def check_field(
     # The tests.
     samples = sample_field(field, points)
     _check_numbers(field, points, samples)
+    # All tests below follow f across its jumps.
+    check_jumps(field, points, generator)
     check_derivatives(field, points, samples)
     _check_rounding(field, points)
     _check_differentiable_value(field, points, samples)
@@ -398,7 +409,7 @@ def _check_promise(
         d = choices[min(k, 2)]
         t = radius[:, None] * fractions
         if not promise.holds_outside_domain:
-            t = np.minimum(radius, _distance_to_exit(field, points, d))[:, None] * fractions
+            t = np.minimum(radius, distance_to_exit(field, points, d))[:, None] * fractions
         lift = lift_along_rays(field, points, d, t)
         movement = lift.moved
         rounding = 1e-9 * (np.abs(samples.value)[:, None] + (field.period or 0) + np.abs(movement))
@@ -419,20 +430,6 @@ def _check_promise(
         worst_points = points + t[rows, worst, None] * d
         message = f"{name}: f leaves what is promised here by more than rounding"
         require(excess.max(axis=1) <= 0, message, points, excess.max(axis=1), worst_points)
-
-
-def _distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
-    """For rays from points (n, 3) in the unit directions d (n, 3), the lengths (n,) at which they
-    leave the field's domain, which is convex; infinite if the field has no domain."""
-    if field.domain is None:
-        return np.full(len(points), np.inf)
-    backend = choose_backend("double")
-    o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
-    ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
-    # `clip` returns where each ray is in the domain: the first and the last position.
-    end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
-    # A little less, for rounding.
-    return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
 
 
 def _harnack_excess(
@@ -484,7 +481,7 @@ def _check_extent(field: Field, level: float, rng: np.random.Generator, count: i
         start = np.concatenate([start, random_points(field, rng, count)])
         start = start[field.domain.contains_points(start)]
     d = random_directions(rng, len(start))
-    length = np.minimum(3 * float(half.max()), _distance_to_exit(field, start, d))
+    length = np.minimum(3 * float(half.max()), distance_to_exit(field, start, d))
     t = np.linspace(0, 1, 160) * length[:, None]
     lift = lift_along_rays(field, start, d, t)
     # f - level along each segment, with its jumps.

@@ -27,12 +27,15 @@ __all__ = [
     "FieldSamples",
     "RayLift",
     "accumulated_jumps",
+    "distance_to_exit",
     "lift_along_rays",
     "random_directions",
     "random_points",
     "require",
     "sample_field",
+    "samples_as_arrays",
     "search_violations",
+    "to_lanes",
 ]
 
 
@@ -105,22 +108,25 @@ def sample_field(
     precision: of the evaluation.
     closely: whether to sample without truncation error.
     """
-    n = len(points)
-    sample = _sample(field, points, precision, closely)
+    return samples_as_arrays(_sample(field, points, precision, closely), len(points))
+
+
+def samples_as_arrays(sample: Sample, n: int) -> FieldSamples:
+    """A Dr.Jit sample at n points as NumPy arrays, with its promises of both kinds."""
     numbers = [list(vars(promise).values()) for promise in sample.all_promises]
     # In one kernel for all of them.
     dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error, numbers)
 
     # (`map_numbers` also passes the exponents of each number's unit.)
     promises = tuple(
-        promise.map_numbers(lambda number, _, __: _to_lanes(number, n))
+        promise.map_numbers(lambda number, _, __: to_lanes(number, n))
         for promise in sample.all_promises
     )
     return FieldSamples(
-        _to_lanes(sample.value, n),
+        to_lanes(sample.value, n),
         np.broadcast_to(to_numpy(sample.gradient), (n, 3)).astype(np.float64),
-        _to_lanes(sample.value_error, n),
-        _to_lanes(sample.gradient_error, n),
+        to_lanes(sample.value_error, n),
+        to_lanes(sample.gradient_error, n),
         promises,
     )
 
@@ -193,7 +199,7 @@ def accumulated_jumps(
     crossing = JumpCrossing(first, backend.UInt32(NO_FACET), backend.Float(0), d)
     while True:
         crossing = jumps.next_crossing(o, d, crossing, last, backend.Bool(True))
-        t, jump = (_to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
+        t, jump = (to_lanes(values, len(start)) for values in (crossing.t, crossing.jump))
         # Rays without another crossing have t = inf.
         is_ahead = np.isfinite(t)
         if not is_ahead.any():
@@ -221,6 +227,20 @@ def random_points(field: Field, rng: np.random.Generator, n: int) -> FloatArray:
     return accepted[:n]
 
 
+def distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatArray:
+    """For rays from points (n, 3) in the unit directions d (n, 3), the lengths (n,) at which they
+    leave the field's domain, which is convex; infinite if the field has no domain."""
+    if field.domain is None:
+        return np.full(len(points), np.inf)
+    backend = choose_backend("double")
+    o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
+    ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
+    # `clip` returns where each ray is in the domain: the first and the last position.
+    end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
+    # A little less, for rounding.
+    return np.maximum(end * (1 - 1e-9) - 1e-12 * np.abs(points).max(axis=1), 0)
+
+
 def random_directions(rng: np.random.Generator, n: int) -> FloatArray:
     """n random unit vectors (n, 3), uniform on the sphere. rng: a generator of random numbers."""
     directions = rng.normal(size=(n, 3))
@@ -238,7 +258,7 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 
-def _to_lanes(value: object, n: int) -> FloatArray:
+def to_lanes(value: object, n: int) -> FloatArray:
     """A Dr.Jit array or a number as a float64 array (n,). A single number is repeated."""
     array = to_numpy(value) if dr.is_array_v(value) else np.asarray(value)
     return np.broadcast_to(array, (n,)).astype(np.float64)
