@@ -168,7 +168,7 @@ class _Neighborhood:
     faces: IntArray
     is_movable: BoolArray
     mesh_vertices: IntArray
-    shifts: dict[bytes, float] = dataclasses.field(default_factory=dict)
+    shifts: dict[bytes, float] = dataclasses.field(default_factory=dict[bytes, float])
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:

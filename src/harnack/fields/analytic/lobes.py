@@ -58,8 +58,9 @@ class Lobes(Field):
 
     Y is as in `SphericalHarmonic`: orthonormal, without the Condon-Shortley phase, m > 0 with cos(m
     phi) and m < 0 with sin(|m| phi). The factor r^2 makes second derivatives bounded at the origin,
-    where all lobes meet: f and its gradient vanish there, and the origin belongs to the surface. To
-    distinguish signs by color, draw both parts:
+    where all lobes meet: f and its gradient vanish there, and the origin belongs to the surface. So
+    a mesh of both signs crosses itself in the origin and is refused: mesh `positive` and
+    `negative`, one by one. To distinguish signs by color, draw both parts:
 
         lobes, signs = hk.fields.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, side="below")
