@@ -97,6 +97,7 @@ __all__ = [
     "is_single_level_set",
     "mesh_solid",
     "solid_and_level",
+    "solid_size",
     "solid_value_range",
 ]
 
@@ -752,7 +753,7 @@ def mesh_solid(
         MeshingError: the solid is not bounded, or is empty, or an operand cannot be meshed.
     """
     lower, upper = _bounds(solid, level, volume)
-    size = float((upper - lower).max())
+    size = solid_size(solid, level, volume)
     cell_size = size / _CELLS_ACROSS if spacing is None else spacing
     # The other half is left for later steps.
     max_error = 0.5 * tolerance.at(size)
@@ -912,6 +913,17 @@ def _mesh_in_volume(
             return _Assembly(manifold, volume)
     cut = volume_manifold(volume, lower, upper, mesher.tolerance)
     return _Assembly(manifold ^ cut, volume)
+
+
+def solid_size(solid: Solid, level: float, volume: Volume | None) -> float:
+    """The longest side of the box in which the part of {solid <= level} in the volume is meshed, a
+    length. volume: None for all of space.
+
+    Raises:
+        MeshingError: there is no finite box, or it is empty.
+    """
+    lower, upper = _bounds(solid, level, volume)
+    return float((upper - lower).max())
 
 
 def _bounds(solid: Solid, level: float, volume: Volume | None) -> tuple[FloatArray, FloatArray]:

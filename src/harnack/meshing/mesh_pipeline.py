@@ -35,6 +35,7 @@ from harnack.meshing.csg_meshing import (
     AngleMesher,
     mesh_solid,
     solid_and_level,
+    solid_size,
     solid_value_range,
 )
 from harnack.meshing.curve_spanning import mesh_spanning_curve
@@ -60,6 +61,7 @@ from harnack.meshing.sign_isosurface import (
     MAX_OFF_LEVEL_FRACTION,
     mesh_from_signs,
 )
+from harnack.meshing.singular_advice import singular_points_explained
 from harnack.meshing.thickening import thicken
 from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.progress import ProgressFunction, show_progress
@@ -211,10 +213,9 @@ def mesh(
     target, trace_choices = surface_and_options("mesh", surface, options, keywords, _HONORED)
     accuracy = MeshTolerance.of(trace_choices)
     check_options(cell_size, thickness, seed, max_triangles)
-    simplify, largest = flag(simplify, "simplify"), target.largest > 0
+    simplify = flag(simplify, "simplify")
     field, level, solid = _checked(target.field), *_level_and_solid(target, thickness)
-    is_closed = bool(solid) or thickness is not None
-    if simplify and not is_closed:
+    if simplify and not solid and thickness is None:
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
     with show_progress("mesh", progress) as reporter:
@@ -226,41 +227,66 @@ def mesh(
             made = _mesh_solid(field, level, solid, asked)
         else:
             made = _mesh_level_set(field, level, asked)
-        triangles, facts = made.surface, dict(made.facts)
+        with singular_points_explained(field, made.function, made.size):
+            return _finished(made, target, solid, thickness, simplify, asked)
+
+
+def _finished(
+    made: _RawMesh,
+    target: Surface,
+    solid: tuple[float, float] | bool,
+    thickness: float | None,
+    simplify: bool,
+    asked: _MeshOptions,
+) -> trimesh.Trimesh:
+    """The result of `mesh`: a mesh that is thickened, reduced to its largest part, checked and
+    simplified, as asked.
+
+    made: the mesh of the level set or solid.
+    target: the surface that is meshed.
+    solid: as returned by `_level_and_solid`.
+    thickness, simplify: the arguments of `mesh`.
+    asked: the other arguments of `mesh`.
+
+    Raises:
+        MeshingError: a check fails, or the surface cannot be thickened.
+    """
+    is_closed, largest = bool(solid) or thickness is not None, target.largest > 0
+    triangles, facts = made.surface, dict(made.facts)
+    if solid:
+        facts["side"] = target.side or "below"
+    else:
+        # Of a level set, `largest` keeps the component with the largest area, before it is
+        # thickened.
+        triangles = largest_component(triangles) if largest else triangles
+        made.check_level(triangles)
+    tolerance = asked.tolerance.at(made.size)
+    if thickness is not None:
+        asked.report("thickening")
+        normals = vertex_normals(made.function, triangles)
+        # Half of the tolerance is left for the simplification.
+        triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
+        facts |= more_facts
+    if largest and is_closed:
+        triangles = largest_body(triangles)
+
+    def check(surface: TriangleMesh) -> None:
+        """Raise a MeshingError unless the mesh `surface`, which was changed, is still a
+        manifold and, for a solid, within the tolerance of the level set."""
         if solid:
-            facts["side"] = target.side or "below"
-        else:
-            # Of a level set, `largest` keeps the component with the largest area, before it is
-            # thickened.
-            triangles = largest_component(triangles) if largest else triangles
-            made.check_level(triangles)
-        tolerance = accuracy.at(made.size)
-        if thickness is not None:
-            asked.report("thickening")
-            normals = vertex_normals(made.function, triangles)
-            # Half of the tolerance is left for the simplification.
-            triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
-            facts |= more_facts
-        if largest and is_closed:
-            triangles = largest_body(triangles)
+            made.check_level(surface)
+        check_manifold(surface.faces)
 
-        def check(surface: TriangleMesh) -> None:
-            """Raise a MeshingError unless the mesh `surface`, which was changed, is still a
-            manifold and, for a solid, within the tolerance of the level set."""
-            if solid:
-                made.check_level(surface)
-            check_manifold(surface.faces)
-
-        # Meshes that are not known to be valid are checked here.
-        if not made.is_checked:
-            asked.report("checking")
-            check(triangles)
-            check_no_self_intersection(triangles.vertices, triangles.faces)
-        if simplify:
-            asked.report("simplifying")
-            triangles, more_facts = simplify_mesh(triangles, tolerance, check)
-            facts |= more_facts
-        return to_trimesh(triangles, facts, is_closed)
+    # Meshes that are not known to be valid are checked here.
+    if not made.is_checked:
+        asked.report("checking")
+        check(triangles)
+        check_no_self_intersection(triangles.vertices, triangles.faces)
+    if simplify:
+        asked.report("simplifying")
+        triangles, more_facts = simplify_mesh(triangles, tolerance, check)
+        facts |= more_facts
+    return to_trimesh(triangles, facts, is_closed)
 
 
 @dataclass(frozen=True)
@@ -694,17 +720,21 @@ def _mesh_solid(
         check_manifold(surface.faces, surface.vertices)
         check_level(surface, size)
 
-    made = mesh_solid(
-        cast("Solid", region.field),
-        region.level,
-        asked.volume,
-        asked.tolerance,
-        asked.spacing,
-        angle_mesher,
-        asked.most_faces,
-        check,
-        asked.report,
-    )
+    solid_field = cast("Solid", region.field)
+    with singular_points_explained(
+        field, region, solid_size(solid_field, region.level, asked.volume)
+    ):
+        made = mesh_solid(
+            solid_field,
+            region.level,
+            asked.volume,
+            asked.tolerance,
+            asked.spacing,
+            angle_mesher,
+            asked.most_faces,
+            check,
+            asked.report,
+        )
     facts = {
         "level": region.level,
         "spacing": made.spacing,
@@ -744,7 +774,10 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
             function, box, mesh_tolerance, cell_size, attempts, asked.seed, report
         )
     else:
-        made, facts = _mesh_in_lattice(function, box, mesh_tolerance, cell_size, attempts, report)
+        with singular_points_explained(field, function, size):
+            made, facts = _mesh_in_lattice(
+                function, box, mesh_tolerance, cell_size, attempts, report
+            )
     # If the clip is a box, the lattice has ended the mesh there already.
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
         made = clip_to_volume(made, volume)

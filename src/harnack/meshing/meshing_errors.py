@@ -41,11 +41,16 @@ class LocalizedMeshingError(MeshingError):
     """A check failed at known locations, so that smaller cells there may be enough.
 
     locations: (k, 3) points.
+    is_explained: whether a cause was looked for (`add`).
     """
 
     def __init__(self, message: str, places: FloatArray) -> None:
         super().__init__(message)
-        self.locations = places
+        self.locations, self.is_explained = places, False
+
+    def add(self, advice: str) -> None:
+        """Add a text, which may be empty, to the end of the message: the cause of the failure."""
+        self.args, self.is_explained = (f"{self}{advice}",), True
 
 
 class OffLevelError(LocalizedMeshingError):

@@ -15,7 +15,7 @@ from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.broad_phase import ROUNDING, near_pairs
 from harnack.meshing.exact_predicates import UNDERFLOW, SignArray, orient2d, orient3d
 
-__all__ = ["intersecting_faces", "touching_pairs"]
+__all__ = ["intersecting_faces", "intersecting_pairs", "touching_pairs"]
 
 _EDGES = ((0, 1), (1, 2), (2, 0))
 _PAIRS_AT_ONCE = 1 << 18
@@ -43,7 +43,18 @@ def intersecting_faces(
     among: (m,) mask of chosen faces; pairs without a chosen face are not tested. None if all are
         chosen.
     """
-    crossing_faces: list[IntArray] = []
+    return np.unique(intersecting_pairs(vertices, faces, among))
+
+
+def intersecting_pairs(
+    vertices: FloatArray, faces: IntArray, among: BoolArray | None = None
+) -> IntArray:
+    """The pairs of faces that meet in more than shared corners and edges, as `intersecting_faces`
+    decides it. Returns their indices (k, 2), each pair once.
+
+    vertices, faces, among: as for `intersecting_faces`.
+    """
+    crossing_pairs: list[IntArray] = []
     for pairs, sides in _pairs_in_doubt(vertices, faces, among):
         first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
         meet = np.zeros(len(pairs), np.bool_)
@@ -55,8 +66,8 @@ def intersecting_faces(
         rows = np.flatnonzero(may_cross)
         meet[rows] = _edge_pierces(vertices, first[rows], second[rows], sides[0][rows])
         meet[rows] |= _edge_pierces(vertices, second[rows], first[rows], sides[1][rows])
-        crossing_faces.append(pairs[meet].ravel())
-    return np.unique(np.concatenate([*crossing_faces, np.zeros(0, np.int64)]))
+        crossing_pairs.append(pairs[meet])
+    return np.concatenate([*crossing_pairs, np.zeros((0, 2), np.int64)])
 
 
 def touching_pairs(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, FloatArray]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from harnack.geometry.mesh_edges import (
 from harnack.geometry.neighborhoods import connected_groups
 from harnack.meshing.checks import check_no_self_intersection
 from harnack.meshing.meshing_errors import SelfIntersectionError
-from harnack.meshing.self_intersection import intersecting_faces
+from harnack.meshing.self_intersection import intersecting_pairs
 from harnack.meshing.triangle_mesh import TriangleMesh
 
 __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
@@ -42,6 +43,10 @@ __all__ = ["resolve_local_intersections", "resolve_self_intersections"]
 _MAX_CROSSING, _MAX_NEIGHBORHOOD = 400, 5_000
 # The largest number of changes in one place, and the number of attempts for each.
 _MAX_CHANGES, _MAX_ATTEMPTS = 40, 80
+# After this many changes in one place, it is given up if all changes that are left would not be
+# enough even if each removed this factor times as many crossings as those so far: there the surface
+# crosses itself, and no slivers do.
+_CHANGES_BEFORE_FORECAST, _FORECAST_FACTOR = 5, 2
 # New triangles with less than this fraction of the area that they cover may face backwards.
 _NO_AREA = 1e-4
 
@@ -155,12 +160,15 @@ class _Neighborhood:
     vertices: (n, 3). faces: (m, 3).
     is_movable: (n,) the mask of the vertices that may be removed. All faces at such a vertex belong
         to the neighborhood.
-    mesh_vertices: (n,) the index of each vertex in the mesh."""
+    mesh_vertices: (n,) the index of each vertex in the mesh.
+    shifts: for changes that were tried, by the faces that they remove and add, how far they move
+        the surface (a length). It is shared by all neighborhoods with the same vertices."""
 
     vertices: FloatArray
     faces: IntArray
     is_movable: BoolArray
     mesh_vertices: IntArray
+    shifts: dict[bytes, float] = dataclasses.field(default_factory=dict[bytes, float])
 
     @classmethod
     def of(cls, vertices: FloatArray, faces: IntArray, movable: IntArray) -> _Neighborhood:
@@ -174,13 +182,23 @@ class _Neighborhood:
             mesh_vertices,
         )
 
-    def crossing(self) -> IntArray:
-        """The indices of faces that pass through others."""
-        return intersecting_faces(self.vertices, self.faces)
+    @cached_property
+    def _faces_at_vertices(self) -> tuple[IntArray, IntArray]:
+        """Two arrays: the indices of faces, sorted by vertex, each face once for each of its
+        corners; and for each vertex the position (n + 1,) at which its faces begin."""
+        corners = self.faces.ravel()
+        order = np.argsort(corners, kind="stable")
+        starts = np.searchsorted(corners[order], np.arange(len(self.vertices) + 1))
+        return order // 3, starts
+
+    def crossing_pairs(self) -> IntArray:
+        """The pairs (k, 2) of indices of faces that pass through each other."""
+        return intersecting_pairs(self.vertices, self.faces)
 
     def around(self, vertex: int) -> IntArray:
         """The indices of the faces at a vertex."""
-        return np.flatnonzero((self.faces == vertex).any(axis=1))
+        rows, starts = self._faces_at_vertices
+        return rows[starts[vertex] : starts[vertex + 1]]
 
     def neighbors(self, vertex: int) -> set[int]:
         """The vertices that share an edge with a vertex."""
@@ -231,44 +249,73 @@ class _Neighborhood:
 
 def _reduce_crossings(patch: _Neighborhood, length: float) -> tuple[IntArray, int]:
     """Contract and flip edges of the neighborhood `patch`, one after the other, as long as each
-    change reduces the number of crossing faces.
+    change reduces the number of crossing faces. Give up early where the changes allowed are far
+    too few.
 
     length: the largest distance by which one change may move the surface.
 
     Returns:
         The faces (m, 3), with vertices of the mesh; and the number of faces that still cross.
     """
-    crossing = patch.crossing()
-    for _ in range(_MAX_CHANGES):
-        better = _best_change(patch, crossing, length) if len(crossing) else None
+    pairs = patch.crossing_pairs()
+    first_count = len(np.unique(pairs))
+    for change_count in range(_MAX_CHANGES):
+        if change_count >= _CHANGES_BEFORE_FORECAST:
+            removed = (first_count - len(np.unique(pairs))) / change_count
+            changes_left = _MAX_CHANGES - change_count
+            if len(np.unique(pairs)) > _FORECAST_FACTOR * removed * changes_left:
+                break
+        better = _best_change(patch, pairs, length) if len(pairs) else None
         if better is None:
             break
-        patch, crossing = better
-    return patch.mesh_vertices[patch.faces], len(crossing)
+        patch, pairs = better
+    return patch.mesh_vertices[patch.faces], len(np.unique(pairs))
 
 
 def _best_change(
-    patch: _Neighborhood, crossing: IntArray, length: float
+    patch: _Neighborhood, pairs: IntArray, length: float
 ) -> tuple[_Neighborhood, IntArray] | None:
     """Find one change of an edge in the neighborhood `patch` that reduces the number of crossing
-    faces. Returns the neighborhood after it, and the indices of the faces that still cross; None if
-    no change does so.
+    faces. Returns the neighborhood after it, and the pairs of faces that still cross; None if no
+    change does so.
 
-    crossing: the indices of the faces that cross now.
+    pairs: (k, 2) the indices of the pairs of faces that cross now.
     length: the largest distance by which the change may move the surface.
 
     Edges of crossing faces are tried first, then all edges of the faces that share a corner with
     them. In both groups, the changes that move the surface least are tried first, up to 80 of them.
     """
+    crossing = np.unique(pairs)
     for candidate_rows in (crossing, _faces_at_corners(patch.faces, patch.faces[crossing])):
         for _, old_rows, new_faces in sorted(
             _changes(patch, candidate_rows, length), key=lambda change: change[0]
         )[:_MAX_ATTEMPTS]:
             changed = patch.with_faces(old_rows, new_faces)
-            still_crossing = changed.crossing()
-            if len(still_crossing) < len(crossing):
+            still_crossing = _pairs_after(changed, pairs, old_rows, len(new_faces))
+            if len(np.unique(still_crossing)) < len(crossing):
                 return changed, still_crossing
     return None
+
+
+def _pairs_after(
+    changed: _Neighborhood, pairs: IntArray, gone: IntArray, new_count: int
+) -> IntArray:
+    """The pairs (k, 2) of faces that cross after a change of a neighborhood. Only the new faces are
+    tested: whether two other faces cross is as before.
+
+    changed: the neighborhood after the change, with the new faces last (`with_faces`).
+    pairs: (k, 2) the pairs that crossed before, in the numbers of the faces then.
+    gone: the indices, then, of the faces that the change removed.
+    new_count: the number of new faces.
+    """
+    kept = pairs[~np.isin(pairs, gone).any(axis=1)]
+    is_new = np.arange(len(changed.faces)) >= len(changed.faces) - new_count
+    return np.concatenate(
+        [
+            kept - np.searchsorted(np.sort(gone), kept),
+            intersecting_pairs(changed.vertices, changed.faces, is_new),
+        ]
+    )
 
 
 def _changes(
@@ -284,21 +331,43 @@ def _changes(
     # A key is the number a * count + b for the edge between the vertices a < b.
     keys = sorted_unique(edge_keys(half_edges(patch.faces[rows]), count))
     for a, b in np.stack(np.divmod(keys, count), axis=1).tolist():
-        for source, target in ((a, b), (b, a)):
-            change = patch.collapse_edge(source, target)
-            if change is not None and _is_small_change(patch, *change, length):
-                # The surface moves by the distance of the removed vertex from the new faces.
-                moved = distance_from_triangles(patch.vertices[source], patch.vertices[change[1]])
-                if moved <= length:
-                    yield moved, *change
-        change = patch.flip_edge(a, b)
-        if change is not None and _is_small_change(patch, *change, length):
-            # The surface moves by the distance between the old and the new edge, which joins c and
-            # d. The first new face is (a, d, c).
-            c, d = (patch.vertices[change[1][0, k]] for k in (2, 1))
-            moved = _line_distance(patch.vertices[a], patch.vertices[b], c, d)
-            if moved <= length:
-                yield moved, *change
+        changes = (patch.collapse_edge(a, b), patch.collapse_edge(b, a), patch.flip_edge(a, b))
+        for change, removed in zip(changes, (a, b, None), strict=True):
+            if change is None:
+                continue
+            key = patch.faces[change[0]].tobytes() + change[1].tobytes()
+            if key not in patch.shifts:
+                patch.shifts[key] = _shift_of(patch, *change, (a, b), removed, length)
+            if patch.shifts[key] <= length:
+                yield patch.shifts[key], *change
+
+
+def _shift_of(
+    patch: _Neighborhood,
+    old_rows: IntArray,
+    new_faces: IntArray,
+    edge: tuple[int, int],
+    removed: int | None,
+    length: float,
+) -> float:
+    """How far a change of an edge of the neighborhood `patch` moves the surface, a length; infinite
+    if the change folds it or is large (`_is_small_change`).
+
+    old_rows: the indices of the faces that are replaced.
+    new_faces: (k, 3) the faces that replace them.
+    edge: the vertices of the edge.
+    removed: the end of the edge that a contraction removes; None for a flip.
+    length: the largest distance by which the change may move the surface.
+    """
+    if not _is_small_change(patch, old_rows, new_faces, length):
+        return np.inf
+    if removed is not None:
+        # The surface moves by the distance of the removed vertex from the new faces.
+        return distance_from_triangles(patch.vertices[removed], patch.vertices[new_faces])
+    # The surface moves by the distance between the old and the new edge, which joins c and d. The
+    # first new face is (a, d, c).
+    a, b, c, d = (patch.vertices[k] for k in (*edge, new_faces[0, 2], new_faces[0, 1]))
+    return _line_distance(a, b, c, d)
 
 
 def _is_small_change(

@@ -18,7 +18,11 @@ from harnack.geometry.mesh_edges import (
 )
 from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.closed_mesh import from_manifold
-from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.meshing_errors import (
+    LocalizedMeshingError,
+    SelfIntersectionError,
+    point_text,
+)
 from harnack.meshing.self_intersection import intersecting_faces
 from harnack.meshing.triangle_mesh import TriangleMesh
 
@@ -56,8 +60,11 @@ def thicken(
     tolerance: a length; how far the polyhedra in place of balls may be from these.
 
     Raises:
-        MeshingError: hulls are needed, and there are too many triangles.
+        MeshingError: hulls are needed, and there are too many triangles. It is a
+            SelfIntersectionError if the surface crosses itself, and is then raised at once.
     """
+    if len(surface.faces) > _MOST_HULLS:
+        _check_not_crossing(surface)
     area = 0.5 * float(np.linalg.norm(area_normals(surface.vertices[surface.faces]), axis=1).sum())
     facts: dict[str, Any] = {"thickness": thickness, "area": area}
     why = _why_too_thick(surface, normals, thickness)
@@ -70,6 +77,19 @@ def thicken(
     return _hull_union(surface, 0.5 * thickness, tolerance, why), {
         **facts, "thickened_by": "hulls of balls", "why": why
     }  # fmt: skip
+
+
+def _check_not_crossing(surface: TriangleMesh) -> None:
+    """Raise a SelfIntersectionError if the surface crosses itself: its reach is 0."""
+    crossing = intersecting_faces(surface.vertices, surface.faces)
+    if len(crossing):
+        centers = surface.vertices[surface.faces[crossing]].mean(axis=1)
+        raise SelfIntersectionError(
+            f"the surface crosses itself, such as near {point_text(centers[0])}: its reach is 0, "
+            "so no `thickness` is small enough",
+            centers,
+            crossing,
+        )
 
 
 def _offset_part(surface: TriangleMesh, normals: FloatArray, thickness: float) -> TriangleMesh:
@@ -159,10 +179,11 @@ def _hull_union(surface: TriangleMesh, radius: float, tolerance: float, why: str
     from manifold3d import Manifold, OpType
 
     if len(surface.faces) > _MOST_HULLS:
-        raise MeshingError(
+        raise LocalizedMeshingError(
             f"{2 * radius:.3g} is thicker than the surface's reach allows ({why}), and there are "
             f"{len(surface.faces):,} triangles, too many for a union of as many hulls: choose a "
-            "larger `tolerance`, or a smaller thickness"
+            "larger `tolerance`, or a smaller thickness",
+            surface.vertices,
         )
     max_error = max(tolerance, 0.1 * radius)
     # A multiple of 4 whose chords are within `max_error` of the circle, from 8 to 16.
