@@ -930,3 +930,64 @@ def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float)
         warnings.filterwarnings("error", message="overflow|divide|invalid")
         found = signed_distance(field, [[far, 0, 0]], method="closest_point", precision="double")
     assert np.isnan(found) | (np.abs(found) >= 0.99 * far)
+
+
+# --- creases ----------------------------------------------------------------------------------
+
+_ATOL_CREASE = 1e-9
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        # Outside, the distance of a union is the smaller one of its operands.
+        ((0.68198523, 0.66800878, 0.32818945), 0.00947903),
+        # Inside, nearest to the crease.
+        ((1.0737746, -0.17090853, -0.16507987), -0.20011330),
+    ],
+)
+def test_distance_of_a_union_beside_its_crease(point: Any, expected: float) -> None:
+    """At these points among 2,000 uniform ones descents ended on the wrong operand, or beside the
+    crease."""
+    solid = hk.Sphere(1.0) | hk.Torus(1.2, 0.4)
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (2000, 3))
+    row = int(np.argmin(np.linalg.norm(points - point, axis=1)))
+    assert points[row] == pytest.approx(point, abs=1e-7)
+    assert signed_distance(solid, points)[row] == pytest.approx(expected, abs=1e-8)
+
+
+def test_distances_inside_a_lens_are_exact_at_its_edge() -> None:
+    """The lens of two unit spheres, also as the complement of the union of their complements: the
+    nearest point of a point in the middle plane is on the edge or on a cap."""
+    left, right = (hk.Sphere(1.0).translated((x, 0, 0)) for x in (-0.4, 0.4))
+    points = np.random.default_rng(5).uniform((0.0, -1.5, -1.5), (0.0, 1.5, 1.5), (500, 3))
+    radius = np.linalg.norm(points, axis=1)
+    edge = math.sqrt(1 - 0.16)
+    expected = np.where(radius > edge, radius - edge, 1 - np.hypot(0.4, radius))
+    for solid in (left & right, ~(~left | ~right)):
+        distance = signed_distance(solid, points)
+        assert np.abs(distance) == pytest.approx(expected, abs=_ATOL_CREASE)
+
+
+def test_distance_of_a_cuboid_from_its_corner() -> None:
+    """The function of a cuboid is its distance outside: where that is proved, it is the result,
+    also where descents along the surface end beside the corner."""
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (20000, 3))
+    half = np.array([1.0, 0.7, 0.5])
+    excess: Any = np.abs(points) - half
+    outside: Any = np.linalg.norm(np.maximum(excess, 0), axis=1)
+    expected: Any = outside + np.minimum(excess.max(axis=1), 0)
+    distance = signed_distance(hk.Cuboid((2.0, 1.4, 1.0)), points)
+    assert distance == pytest.approx(expected, abs=1e-6)
+
+
+def test_operands_of_nested_combinations() -> None:
+    """At every point the function of a combination is that of one of its operands."""
+    drilled = hk.Cuboid((2.0, 2.0, 2.0)) - hk.Cylinder(0.4, 3.0)
+    field = (~drilled).offset(-0.1) | hk.Sphere(0.5)
+    points = np.random.default_rng(1).uniform(-1.5, 1.5, (200, 3))
+    values = [operand.value(points) for operand in field.operands()]
+    assert len(values) == 3
+    difference = np.abs(np.array(values) - field.value(points)).min(axis=0)
+    assert difference == pytest.approx(0, abs=1e-12)
+    assert hk.Sphere(1.0).operands()[1:] == ()

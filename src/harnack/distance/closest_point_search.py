@@ -39,6 +39,7 @@ from harnack.backend.elementary import max_norm, safe_norm
 from harnack.distance.cell_classification import ClipCurveDescent
 from harnack.distance.cell_search import InitialGuess, SearchResult, StoppingRule, search
 from harnack.distance.closest_point_descent import ClosestPointDescent
+from harnack.distance.crease_search import MAX_OPERANDS, CreaseSearch
 from harnack.distance.jump_surface_search import JumpSurfaceSearch, compass_search
 from harnack.distance.level_triangles import LevelTriangles
 from harnack.distance.tangent_plane import first_order_distance, in_batches
@@ -62,6 +63,9 @@ _ROUNDING = 64.0
 # Fraction of the surface's size: cells are split until none can hold a point that is nearer than
 # the best one by more than this.
 _TOLERANCE = 1e-6
+# Fraction of that tolerance: distances of combined solids that exceed a proved lower bound by more
+# are improved at creases.
+_SETTLED = 1e-4
 # Bits per axis of the Morton codes by which points are sorted.
 _MORTON_BITS = 10
 # The surface is followed from its boundary in the direction of the query, or in one that points
@@ -169,6 +173,14 @@ def _find_sorted(
     result.closest = _with_singular_points(
         surface, x, evaluator.remove_truncation(x, result.closest)
     )
+    if surface.field.jumps is None:
+        proved = np.maximum(lower, result.lower_bounds)
+        result.closest = _with_gradient_feet(
+            evaluator, x, result.closest, estimate, proved + tolerance.length
+        )
+        result.closest = _with_crease_points(
+            evaluator, x, result.closest, proved + _SETTLED * tolerance.length
+        )
     distance = _length(x - result.closest)
     # A closest point may be nearer than the proved lower bound: either rounding has moved it off
     # the surface, or a promise of the field does not hold.
@@ -184,6 +196,59 @@ def _find_sorted(
     # The cells may prove more than f at the query alone.
     lower = np.fmin(np.maximum(lower, result.lower_bounds), distance)
     return ClosestPoints(x, closest, distance, residual, lower, is_refused)
+
+
+def _with_gradient_feet(
+    evaluator: _QueryEvaluator, points: FloatArray, closest: FloatArray, estimate: FloatArray,
+    settled: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Return the closest points of queries, replaced where f is a distance: there the surface point
+    to which the gradient leads is the closest one, even at an edge or a corner, where descents
+    along the surface may end beside it. This is so where the estimate of the distance is proved.
+
+    points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
+    estimate: (n,) first-order estimates of the distances.
+    settled: (n,) the length up to which a distance needs no improvement: its proved lower bound and
+        the tolerance.
+    """
+    distance = _length(points - closest)
+    rows = np.flatnonzero(~(distance <= settled) & (estimate <= settled))
+    if not len(rows):
+        return closest
+    feet = evaluator.gradient_feet(points[rows])
+    is_nearer = _length(points[rows] - feet) < np.nan_to_num(distance[rows], nan=np.inf)
+    closest = closest.copy()
+    closest[rows[is_nearer]] = feet[is_nearer]
+    return closest
+
+
+def _with_crease_points(
+    evaluator: _QueryEvaluator, points: FloatArray, closest: FloatArray, settled: FloatArray
+) -> FloatArray:
+    """Return the closest points of queries on a combination of solids, replaced where descents
+    along one operand alone, or along the creases at which operands meet, find nearer ones
+    (`CreaseSearch`). Fields that are no combinations keep their points, and so do combinations of
+    more operands than `MAX_OPERANDS`.
+
+    points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
+    settled: (n,) the length up to which a distance needs no improvement: its proved lower bound and
+        a fraction of the tolerance.
+    """
+    backend, surface = evaluator.backend, evaluator.surface
+    operands = surface.field.operands()
+    rows = np.flatnonzero(~(_length(points - closest) <= settled))
+    if not 1 < len(operands) <= MAX_OPERANDS or not len(rows):
+        return closest
+    descents = (
+        _QueryEvaluator(backend, replace(surface, field=operand), evaluator.levels)
+        for operand in operands
+    )
+    creases = CreaseSearch(backend, evaluator.prepared, evaluator.levels, tuple(descents))
+    found = evaluator.inside_domain_or_nan(creases.candidates(points[rows], closest[rows]))
+    is_found = ~np.isnan(found[:, 0])
+    closest = closest.copy()
+    closest[rows[is_found]] = found[is_found]
+    return closest
 
 
 def _search_smooth_part(
@@ -376,6 +441,21 @@ class _QueryEvaluator:
     _clip: ClipCurveDescent | None = dataclasses.field(init=False)
     _tracer: Any = dataclasses.field(init=False)
 
+    @property
+    def prepared(self) -> Field:
+        """The function f, prepared for the backend."""
+        return self._field
+
+    def gradient_feet(self, points: FloatArray) -> FloatArray:
+        """Return the points of the surface (n, 3) to which Newton's method along the gradient leads
+        from `points` (n, 3); NaN where it leads to none."""
+
+        def to_level(p: Vec3) -> tuple[Vec3]:
+            return (self._descent.newton_to_level(p),)
+
+        (feet,) = in_batches(self.backend, to_level, points)
+        return self.inside_domain_or_nan(feet)
+
     def evaluate(self, points: Any) -> tuple[FloatArray, ...]:
         """Evaluate f at query points, and return first estimates of their distances.
 
@@ -416,7 +496,7 @@ class _QueryEvaluator:
         if domain is not None and len(x):
             # Nothing is promised outside the domain.
             lower[~domain.contains_points(x)] = 0
-        return x, self._inside_domain_or_nan(surface_point), residual, lower, estimate
+        return x, self.inside_domain_or_nan(surface_point), residual, lower, estimate
 
     def with_jump_points(self, points: FloatArray, guess: FloatArray) -> FloatArray:
         """Return surface points (n, 3) near queries. They are those of `guess`, except for queries
@@ -502,7 +582,7 @@ class _QueryEvaluator:
         (closest,) = in_batches(self._tracer.backend, compute, points, guess)
         return np.where(np.isnan(closest), guess, closest)
 
-    def _inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
+    def inside_domain_or_nan(self, points: FloatArray) -> FloatArray:
         """Return the points (n, 3), with NaN in place of those outside the field's domain, as the
         domain cuts the surface."""
         domain = self.surface.field.domain
@@ -559,7 +639,7 @@ class _QueryEvaluator:
             closest[rows], free[rows] = in_batches(
                 self.backend, self._descend, points[rows], y[rows]
             )
-        closest = self._inside_domain_or_nan(closest)
+        closest = self.inside_domain_or_nan(closest)
         ids, clip = np.flatnonzero(np.isnan(closest[:, 0]) & (is_far == 0)), self._clip
         # Closest points outside the domain are replaced by points of the clip curve.
         if clip is not None and len(ids):
@@ -569,7 +649,7 @@ class _QueryEvaluator:
                 return (clip.closest(p, y)[0],)
 
             (clipped,) = in_batches(self.backend, to_clip_curve, points[ids], start[ids])
-            closest[ids], free[ids] = self._inside_domain_or_nan(clipped), 0
+            closest[ids], free[ids] = self.inside_domain_or_nan(clipped), 0
         return closest, free
 
     def descend_from_boundary(
@@ -627,7 +707,7 @@ class _QueryEvaluator:
         rows, start = rows[~np.isnan(start[:, 0])], start[~np.isnan(start[:, 0])]
         if len(rows):
             closest[rows], free[rows] = in_batches(self.backend, self._descend, points[rows], start)
-        return self._inside_domain_or_nan(closest), free
+        return self.inside_domain_or_nan(closest), free
 
     def newton_in_kernel(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask]:
         """Run Newton's method for the closest point to the query x, as part of another kernel.
@@ -721,7 +801,7 @@ class _QueryEvaluator:
                 self.backend, to_level, closest[rows[failed_rows]]
             )
         # Points that the correction moved out of the domain keep their place.
-        is_inside = ~np.isnan(self._inside_domain_or_nan(corrected)[:, 0])
+        is_inside = ~np.isnan(self.inside_domain_or_nan(corrected)[:, 0])
         closest[rows[is_inside]] = corrected[is_inside]
         return closest
 

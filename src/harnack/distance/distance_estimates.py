@@ -72,6 +72,8 @@ def signed_distance(
         "closest_point": the distance to the nearest surface point that a search finds
             (`closest_points` says how). It is an upper bound of the true distance, and exact to
             rounding if the search finds the closest point. `distance_bounds` gives proved bounds.
+            Beside creases (edges where f has no gradient) of formulas, and of combinations of more
+            than 12 solids, it may be too long; of combinations of fewer, creases are searched.
             For a closed triangle mesh, and for the boundary of the solid of a closed mesh, it is
             exact to rounding. NaN where no surface is found: there is none, or it was found only
             within a radius that the field promises to be free. A RuntimeWarning counts these

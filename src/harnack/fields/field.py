@@ -296,6 +296,12 @@ class Field(Parametrized, abc.ABC):
         del levels
         return None
 
+    def operands(self) -> tuple[Field, ...]:
+        """The fields of which this one is combined: at each point its function is that of one of
+        them. So each of its level sets lies in the union of theirs at the same level. A field that
+        is no combination is its own only operand."""
+        return (self,)
+
     def for_ray_count(self, count: int) -> Field:
         """The field to use when `count` rays are traced: for many rays, a longer preparation may
         save time. Equal counts must return the same object, so that nothing is prepared twice. The

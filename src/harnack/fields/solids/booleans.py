@@ -128,6 +128,9 @@ class BooleanSolid(Solid):
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
+    def operands(self) -> tuple[Field, ...]:
+        return tuple(operand for part in self.parts for operand in part.operands())
+
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
         where f >= level; None if no such volume is known.

@@ -377,6 +377,12 @@ class SolidOfField(Solid):
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
+    def operands(self) -> tuple[Field, ...]:
+        """If the inner field is a combination, the solids of the same kind, such as complements, of
+        its operands; otherwise this solid alone."""
+        inner = self.field.operands()
+        return tuple(map(self._with_inner, inner)) if len(inner) > 1 else (self,)
+
     @property
     def is_steep(self) -> bool:
         return self.field.is_steep
