@@ -57,8 +57,7 @@ class Lobes(Field):
     x/|x|, the field is f = r^2 (r^2 - Y(u)^2) for both signs, and f = r^2 (r - Y(u)) or r^2 (r +
     Y(u)) for the lobes where Y is positive or negative. The lobes are the points with f <= 0.
 
-    Y is as in `SphericalHarmonic`: orthonormal, without the Condon-Shortley phase, m > 0 with cos(m
-    phi) and m < 0 with sin(|m| phi). The factor r^2 makes second derivatives bounded at the origin,
+    Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi). The factor r^2 makes second derivatives bounded at the origin,
     where all lobes meet: f and its gradient vanish there, and the origin belongs to the surface. So
     a mesh of both signs crosses itself in the origin and is refused: mesh `positive` and
     `negative`, one by one. To distinguish signs by color, draw both parts:
