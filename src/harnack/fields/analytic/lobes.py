@@ -57,10 +57,11 @@ class Lobes(Field):
     x/|x|, the field is f = r^2 (r^2 - Y(u)^2) for both signs, and f = r^2 (r - Y(u)) or r^2 (r +
     Y(u)) for the lobes where Y is positive or negative. The lobes are the points with f <= 0.
 
-    Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi). The factor r^2 makes second derivatives bounded at the origin,
-    where all lobes meet: f and its gradient vanish there, and the origin belongs to the surface. So
-    a mesh of both signs crosses itself in the origin and is refused: mesh `positive` and
-    `negative`, one by one. To distinguish signs by color, draw both parts:
+    Orders m > 0 contain cos(m phi), orders m < 0 contain sin(|m| phi). The factor r^2 makes second
+    derivatives bounded at the origin, where all lobes meet: f and its gradient vanish there, and
+    the origin belongs to the surface. So a mesh of both signs crosses itself at the origin and is
+    refused: mesh `positive` and `negative`, one by one. To distinguish signs by color, draw both
+    parts:
 
         lobes, signs = hk.fields.Lobes(3, 2), ["plastic", "porcelain"]
         hk.render([lobes.positive, lobes.negative], material=signs, side="below")
