@@ -23,7 +23,7 @@ def message(field: hk.Field, level: float = 0.0, place: object = _PLACE) -> str:
     function = LevelFunction(field, level)
     with (
         pytest.raises(LocalizedMeshingError) as error,
-        singular_points_explained(field, function, 2.0),
+        singular_points_explained(field, function, lambda: 2.0),
     ):
         raise LocalizedMeshingError("failed", np.asarray(place, np.float64))
     return str(error.value)

@@ -227,7 +227,7 @@ def mesh(
             made = _mesh_solid(field, level, solid, asked)
         else:
             made = _mesh_level_set(field, level, asked)
-        with singular_points_explained(field, made.function, made.size):
+        with singular_points_explained(field, made.function, lambda: made.size):
             return _finished(made, target, solid, thickness, simplify, asked)
 
 
@@ -722,7 +722,7 @@ def _mesh_solid(
 
     solid_field = cast("Solid", region.field)
     with singular_points_explained(
-        field, region, solid_size(solid_field, region.level, asked.volume)
+        field, region, lambda: solid_size(solid_field, region.level, asked.volume)
     ):
         made = mesh_solid(
             solid_field,
@@ -774,7 +774,7 @@ def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _
             function, box, mesh_tolerance, cell_size, attempts, asked.seed, report
         )
     else:
-        with singular_points_explained(field, function, size):
+        with singular_points_explained(field, function, lambda: size):
             made, facts = _mesh_in_lattice(
                 function, box, mesh_tolerance, cell_size, attempts, report
             )

@@ -4,7 +4,7 @@ two sheets cross. No mesh of triangles without self-intersections is near such a
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
 import numpy as np
@@ -31,20 +31,21 @@ _VANISHES = 0.05
 
 @contextmanager
 def singular_points_explained(
-    field: Field, function: LevelFunction, size: float
+    field: Field, function: LevelFunction, size: Callable[[], float]
 ) -> Generator[None]:
     """A context that adds to the message of a LocalizedMeshingError raised in it, if the surface
     has a singular point near a place where the check failed.
 
     field: the field as the user gave it.
     function: the function of the level set that is meshed.
-    size: the longest side of the box in which it is meshed, a length.
+    size: a function that returns the longest side of the box in which it is meshed, a length. It
+        is called only if there is an error.
     """
     try:
         yield
     except LocalizedMeshingError as error:
         if not error.is_explained:
-            error.add(_advice(field, function, error.locations, size))
+            error.add(_advice(field, function, error.locations, size()))
         raise
 
 
