@@ -20,7 +20,7 @@ from tests.oracles.direct_sums import winding_sum
 
 Function = Callable[[Any], Any]
 TOLERANCE = 1e-2  # as a part of the longest side
-SECONDS = 10.0
+SECONDS = 60.0
 
 # Letters a to d stand for random numbers.
 SMOOTH = (
