@@ -45,9 +45,9 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
 def _is_shortened(text: str, name: str) -> bool:
     """Return whether a text is a name with dots of which parts are left out, but not the last one:
     "parts.0.radius" for "parts.0.field.radius"."""
-    given, remaining = text.split("."), iter(name.split("."))
+    parts, remaining = text.split("."), iter(name.split("."))
     # `in` takes entries from the iterator up to the one it finds.
-    return name.endswith(f".{given[-1]}") and all(part in remaining for part in given)
+    return name.endswith(f".{parts[-1]}") and all(part in remaining for part in parts)
 
 
 def _begins_word(text: str, name: str) -> bool:

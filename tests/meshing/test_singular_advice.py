@@ -59,7 +59,7 @@ def test_branches_and_lobes_have_advice_of_their_own() -> None:
 
 
 def test_meshes_of_lobes_say_that_these_meet() -> None:
-    with pytest.raises(ValueError, match=r"lobes of both signs meet in the origin"):
+    with pytest.raises(ValueError, match=r"lobes of both signs meet at the origin"):
         hk.mesh(hk.fields.Lobes(3, 2), cell_size=0.08, tolerance=5e-3)
 
 

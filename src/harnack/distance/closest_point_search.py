@@ -244,10 +244,10 @@ def _with_crease_points(
         for operand in operands
     )
     creases = CreaseSearch(backend, evaluator.prepared, evaluator.levels, tuple(descents))
-    found = evaluator.inside_domain_or_nan(creases.candidates(points[rows], closest[rows]))
-    is_found = ~np.isnan(found[:, 0])
+    candidates = evaluator.inside_domain_or_nan(creases.candidates(points[rows], closest[rows]))
+    is_found = ~np.isnan(candidates[:, 0])
     closest = closest.copy()
-    closest[rows[is_found]] = found[is_found]
+    closest[rows[is_found]] = candidates[is_found]
     return closest
 
 

@@ -142,28 +142,28 @@ class CreaseSearch:
             (closest[rows],) = in_batches(self.backend, follow, points[rows], start[rows])
         return closest
 
-    def _update(self, points: FloatArray, best: FloatArray, found: FloatArray) -> None:
-        """Replace the best points of the queries by those found, in place, where these are nearer
+    def _update(self, points: FloatArray, best: FloatArray, candidates: FloatArray) -> None:
+        """Replace the best points of the queries by candidates, in place, where these are nearer
         and f has the level there."""
         old_distance = np.linalg.norm(points - best, axis=1)
-        distance = np.linalg.norm(points - found, axis=1)
+        distance = np.linalg.norm(points - candidates, axis=1)
         is_nearer = distance < np.where(np.isnan(old_distance), np.inf, old_distance)
         rows = np.flatnonzero(is_nearer)
-        rows = rows[self._is_on_level(found[rows])]
-        best[rows] = found[rows]
+        rows = rows[self._is_on_level(candidates[rows])]
+        best[rows] = candidates[rows]
 
     def _is_on_level(self, points: FloatArray) -> BoolArray:
         """Return the mask (n,) of points (n, 3) at which f has a level, up to rounding."""
         if not len(points):
             return np.zeros(0, np.bool_)
-        one, zero = self.backend.Float(1), self.backend.Float(0)
+        yes, no = self.backend.Float(1), self.backend.Float(0)
 
         def compute(p: Vec3) -> tuple[Real]:
-            """Return 1 where f has a level at p, else 0, as a tuple of one."""
+            """Return 1 where f has a level at p, else 0, as a tuple."""
             sample = self.field.evaluate(p)
             rounding = _LEVEL_ROUNDING * self.backend.machine_epsilon * max_norm(p)
             allowed = dr.fma(rounding, safe_norm(sample.gradient), 2 * sample.value_error)
             is_on = dr.abs(self.levels.offset_to_nearest(sample.value)) <= allowed
-            return (dr.select(is_on, one, zero),)
+            return (dr.select(is_on, yes, no),)
 
         return in_batches(self.backend, compute, points)[0] > 0

@@ -34,7 +34,7 @@ class ConstructorCall:
     """What is remembered of the call that made an object.
 
     maker: the name of the class method that was called; "" for the class itself.
-    given: the names of the arguments that were given.
+    argument_names: the names of the arguments of the call.
     choices: those of them that are strings, booleans or None, such as method="auto".
     kept: those that are not copied by constructors, such as numbers, functions, volumes and
         Dr.Jit arrays. NumPy arrays, lists and mappings are not kept: the object stores its own
@@ -42,7 +42,7 @@ class ConstructorCall:
     """
 
     maker: str = ""
-    given: tuple[str, ...] = ()
+    argument_names: tuple[str, ...] = ()
     choices: dict[str, Any] = field(default_factory=dict[str, Any])
     kept: dict[str, Any] = field(default_factory=dict[str, Any])
 
@@ -78,12 +78,12 @@ def _signature(kind: type, maker: str) -> inspect.Signature:
 
 
 def record_call(
-    made: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], maker: str = ""
+    instance: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], maker: str = ""
 ) -> None:
     """Remember the call that makes an object, for `Parametrized.replace`. An argument `domain` is
     checked first, here for all classes.
 
-    made: the object.
+    instance: the object.
     args, kwargs: the arguments of the call. If these are no arguments of the maker, so that it is
         going to raise an error, nothing is remembered.
     maker: the name of the class method that is called; "" for the class itself.
@@ -91,7 +91,7 @@ def record_call(
     Raises:
         TypeError: the argument `domain` is neither a volume nor None.
     """
-    signature = _signature(cast("Any", type(made)), maker)
+    signature = _signature(cast("Any", type(instance)), maker)
     try:
         arguments = dict(signature.bind(*args, **kwargs).arguments)
     except TypeError:
@@ -101,20 +101,20 @@ def record_call(
         if parameter.kind is inspect.Parameter.VAR_KEYWORD:
             arguments |= arguments.pop(name, {})
     check_volume(arguments.get("domain"), "domain")
-    vars(made)["_constructor_call"] = ConstructorCall.of(maker, arguments)
+    vars(instance)["_constructor_call"] = ConstructorCall.of(maker, arguments)
 
 
-def record_arguments(made: Any, **arguments: Any) -> None:
+def record_arguments(instance: Any, **arguments: Any) -> None:
     """Take these arguments for those with which an object was made, in place of the ones that were
     given, such as a number that was found for "auto"."""
-    call = _call_of(made)
-    old = dict.fromkeys(call.given, _NOTHING) | call.choices | call.kept
-    vars(made)["_constructor_call"] = ConstructorCall.of(call.maker, old | arguments)
+    call = _call_of(instance)
+    old = dict.fromkeys(call.argument_names, _NOTHING) | call.choices | call.kept
+    vars(instance)["_constructor_call"] = ConstructorCall.of(call.maker, old | arguments)
 
 
-def _call_of(made: object) -> ConstructorCall:
+def _call_of(instance: object) -> ConstructorCall:
     """The call that made an object, as far as it is known."""
-    return vars(made).get("_constructor_call", ConstructorCall())
+    return vars(instance).get("_constructor_call", ConstructorCall())
 
 
 class Parametrized:
@@ -136,19 +136,19 @@ class Parametrized:
         """
         call = _call_of(self)
         parameters = _signature(type(self), call.maker).parameters
-        found: dict[str, Any] = {}
-        for name in dict.fromkeys((*parameters, *call.given)):
+        arguments: dict[str, Any] = {}
+        for name in dict.fromkeys((*parameters, *call.argument_names)):
             # A kept argument; else what the object stores; else a choice that was given, or the
             # default.
             if name in call.kept:
                 value = call.kept[name]
-            elif (value := _stored(self, name)) is _NOTHING and name in call.given:
+            elif (value := _stored(self, name)) is _NOTHING and name in call.argument_names:
                 value = call.choices.get(name, _NOTHING)
             elif value is _NOTHING and parameters[name].default is not inspect.Parameter.empty:
                 value = parameters[name].default
             if value is not _NOTHING:
-                found[name] = value
-        return found
+                arguments[name] = value
+        return arguments
 
     def parameters(self) -> dict[str, Any]:
         """The parameters by name: the numbers, NumPy arrays and Dr.Jit arrays in the arguments of
@@ -178,14 +178,14 @@ class Parametrized:
         call, arguments = _call_of(self), self.constructor_arguments()
         signature = _signature(type(self), call.maker)
         self._check_names(changes, {*arguments, *signature.parameters})
-        # What was left to the constructor, which is not in `given`, is left to it again.
-        given = {
+        # What was left to the constructor, which is no argument of the call, is left to it again.
+        new_arguments = {
             name: call.choices[name] if name in call.choices else arguments.get(name, _NOTHING)
-            for name in call.given
+            for name in call.argument_names
         }
         for name, inside in _by_part({*arguments, *signature.parameters}, changes).items():
-            given[name] = _exchanged(arguments.get(name), inside)
-        for name, value in given.items():
+            new_arguments[name] = _exchanged(arguments.get(name), inside)
+        for name, value in new_arguments.items():
             if value is _NOTHING:
                 raise TypeError(
                     f"{with_article(type(self).__name__)} does not store the argument {name!r} "
@@ -194,8 +194,12 @@ class Parametrized:
                 )
         make = getattr(type(self), call.maker) if call.maker else type(self)
         # Names that the signature lacks are passed on by the constructor's **kwargs.
-        extra = {name: given.pop(name) for name in [*given] if name not in signature.parameters}
-        bound = inspect.BoundArguments(signature, cast("Any", given))
+        extra = {
+            name: new_arguments.pop(name)
+            for name in [*new_arguments]
+            if name not in signature.parameters
+        }
+        bound = inspect.BoundArguments(signature, cast("Any", new_arguments))
         return make(*bound.args, **bound.kwargs, **extra)
 
     def _check_names(self, changes: Mapping[str, Any], arguments: set[str]) -> None:
@@ -225,16 +229,16 @@ class Parametrized:
         return tuple(value for value in self.parameters().values() if _is_drjit(value))
 
 
-def _stored(made: object, name: str) -> Any:
+def _stored(instance: object, name: str) -> Any:
     """The attribute or property of an object that holds the argument `name` of its constructor;
     `_NOTHING` if there is none. Attributes of the class do not count: they are defaults."""
     for attribute in (f"_{name}", name):
-        if attribute in vars(made):
-            return vars(made)[attribute]
+        if attribute in vars(instance):
+            return vars(instance)[attribute]
         # The class that defines the attribute; `object` if none does.
-        kind = next((kind for kind in type(made).__mro__ if attribute in vars(kind)), object)
+        kind = next((kind for kind in type(instance).__mro__ if attribute in vars(kind)), object)
         if isinstance(vars(kind).get(attribute), property | cached_property):
-            return getattr(made, attribute)
+            return getattr(instance, attribute)
     return _NOTHING
 
 
@@ -290,13 +294,13 @@ def _by_part(parts: Iterable[str], changes: Mapping[str, Any]) -> dict[str, dict
         TypeError: a change is in none of the parts.
     """
     longest_first = sorted(parts, key=len, reverse=True)  # "1.5" before "1"
-    found: dict[str, dict[str, Any]] = {}
+    changes_by_part: dict[str, dict[str, Any]] = {}
     for changed, value in changes.items():
         part = next((name for name in longest_first if f"{changed}.".startswith(f"{name}.")), None)
         if part is None:  # of a part that is exchanged as a whole, too, and has other names now
             raise TypeError(f"there is no {changed!r} in the new value of what holds it")
-        found.setdefault(part, {})[changed.removeprefix(part).removeprefix(".")] = value
-    return found
+        changes_by_part.setdefault(part, {})[changed.removeprefix(part).removeprefix(".")] = value
+    return changes_by_part
 
 
 def _exchanged(value: Any, changes: dict[str, Any]) -> Any:

@@ -468,13 +468,13 @@ class LiftedProduct:
         new_re = dr.fma(self.re, re, -(self.im * im))
         new_im = dr.fma(self.re, im, self.im * re)
         scale = dr.rcp(dr.abs(new_re) + dr.abs(new_im))
-        one = type(new_re)(1)
+        turn = type(new_re)(1)
         new_im = dr.select(new_im == 0, 0, new_im)  # no zero with a sign, which would be -pi
         # The sum can leave the interval only if one of the arguments is at least pi/2 in size;
         # testing for this keeps underflow from counting.
         may_wrap = (self.re <= 0) | (re <= 0)
-        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, one, 0)
-        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, one, 0)
+        turns_up = dr.select((self.im >= 0) & (im >= 0) & (new_im < 0) & may_wrap, turn, 0)
+        turns_down = dr.select((self.im < 0) & (im < 0) & (new_im >= 0) & may_wrap, turn, 0)
         is_finite = dr.isfinite(scale)
         return LiftedProduct(
             dr.select(is_finite, new_re * scale, self.re),

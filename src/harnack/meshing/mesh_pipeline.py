@@ -219,51 +219,51 @@ def mesh(
         raise ValueError('simplify is for closed meshes: give side="below" or thickness as well')
     volume = intersection_of([field.domain, target.clip, target.section])
     with show_progress("mesh", progress) as reporter:
-        asked = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, reporter.tell)
+        mesh_options = _MeshOptions(volume, accuracy, cell_size, seed, max_triangles, reporter.tell)
         # Three ways of meshing, by the kind of the field.
         if uses_sign_meshing(field):
-            made = _mesh_from_signs(field, level, solid, thickness is not None, asked)
+            raw_mesh = _mesh_from_signs(field, level, solid, thickness is not None, mesh_options)
         elif solid:
-            made = _mesh_solid(field, level, solid, asked)
+            raw_mesh = _mesh_solid(field, level, solid, mesh_options)
         else:
-            made = _mesh_level_set(field, level, asked)
-        with singular_points_explained(field, made.function, lambda: made.size):
-            return _finished(made, target, solid, thickness, simplify, asked)
+            raw_mesh = _mesh_level_set(field, level, mesh_options)
+        with singular_points_explained(field, raw_mesh.function, lambda: raw_mesh.size):
+            return _finished(raw_mesh, target, solid, thickness, simplify, mesh_options)
 
 
 def _finished(
-    made: _RawMesh,
+    raw_mesh: _RawMesh,
     target: Surface,
     solid: tuple[float, float] | bool,
     thickness: float | None,
     simplify: bool,
-    asked: _MeshOptions,
+    mesh_options: _MeshOptions,
 ) -> trimesh.Trimesh:
     """The result of `mesh`: a mesh that is thickened, reduced to its largest part, checked and
     simplified, as asked.
 
-    made: the mesh of the level set or solid.
+    raw_mesh: the mesh of the level set or solid.
     target: the surface that is meshed.
     solid: as returned by `_level_and_solid`.
     thickness, simplify: the arguments of `mesh`.
-    asked: the other arguments of `mesh`.
+    mesh_options: the other arguments of `mesh`.
 
     Raises:
         MeshingError: a check fails, or the surface cannot be thickened.
     """
     is_closed, largest = bool(solid) or thickness is not None, target.largest > 0
-    triangles, facts = made.surface, dict(made.facts)
+    triangles, facts = raw_mesh.surface, dict(raw_mesh.facts)
     if solid:
         facts["side"] = target.side or "below"
     else:
         # Of a level set, `largest` keeps the component with the largest area, before it is
         # thickened.
         triangles = largest_component(triangles) if largest else triangles
-        made.check_level(triangles)
-    tolerance = asked.tolerance.at(made.size)
+        raw_mesh.check_level(triangles)
+    tolerance = mesh_options.tolerance.at(raw_mesh.size)
     if thickness is not None:
-        asked.report("thickening")
-        normals = vertex_normals(made.function, triangles)
+        mesh_options.report("thickening")
+        normals = vertex_normals(raw_mesh.function, triangles)
         # Half of the tolerance is left for the simplification.
         triangles, more_facts = thicken(triangles, normals, float(thickness), 0.5 * tolerance)
         facts |= more_facts
@@ -274,16 +274,16 @@ def _finished(
         """Raise a MeshingError unless the mesh `surface`, which was changed, is still a
         manifold and, for a solid, within the tolerance of the level set."""
         if solid:
-            made.check_level(surface)
+            raw_mesh.check_level(surface)
         check_manifold(surface.faces)
 
     # Meshes that are not known to be valid are checked here.
-    if not made.is_checked:
-        asked.report("checking")
+    if not raw_mesh.is_checked:
+        mesh_options.report("checking")
         check(triangles)
         check_no_self_intersection(triangles.vertices, triangles.faces)
     if simplify:
-        asked.report("simplifying")
+        mesh_options.report("simplifying")
         triangles, more_facts = simplify_mesh(triangles, tolerance, check)
         facts |= more_facts
     return to_trimesh(triangles, facts, is_closed)
@@ -335,7 +335,7 @@ def _mesh_from_signs(
     level: float | None,
     solid: tuple[float, float] | bool,
     is_thick: bool,
-    asked: _MeshOptions,
+    mesh_options: _MeshOptions,
 ) -> _RawMesh:
     """Mesh a level set of the field's function f, or the closed surface of a solid, from the signs
     of f - level at the points of a lattice.
@@ -344,7 +344,7 @@ def _mesh_from_signs(
     solid: False for a level set; True for the points of a `Solid`; or the interval (low, high) of
         the values of f in a solid.
     is_thick: whether the level set will be thickened.
-    asked: the arguments of `mesh`.
+    mesh_options: the arguments of `mesh`.
 
     A winding number whose mesh lies on its own level set is not meshed: its triangles are the
     result (`_faces_alone`). A solid between two levels is computed from closed meshes of both level
@@ -356,12 +356,12 @@ def _mesh_from_signs(
     ends = _ends_by_signs(field, level, solid, is_thick)
     levels = tuple(end for end in ends if math.isfinite(end))
     if isinstance(field, WindingNumber) and field.is_whole_surface(levels):
-        return _faces_alone(field, levels[0], solid, asked)
-    volume, box = asked.volume, _box(field, levels, asked.volume)
+        return _faces_alone(field, levels[0], solid, mesh_options)
+    volume, box = mesh_options.volume, _box(field, levels, mesh_options.volume)
     size = float((box.upper - box.lower).max())
     if solid and _is_outside_inside(field, ends, box):
         box = _unlimited_box(field, volume)
-    cell_size, attempts = _cells_by_signs(field, size, asked.spacing)
+    cell_size, attempts = _cells_by_signs(field, size, mesh_options.spacing)
     # If the surface may not end at the box, the box is enlarged by uneven amounts: otherwise
     # lattice points would lie on planes of symmetry, where f often equals its level.
     margin = np.zeros(3) if box.has_walls else size * np.array([0.0037, 0.0053, 0.0029])
@@ -373,7 +373,7 @@ def _mesh_from_signs(
         """The function side * (f - value). Its level set 0 is the level set of f at `value`; it is
         positive on one side of it."""
         return SignFunction.of(
-            field, value, lattice_box, cell_size, side=side, most_faces=asked.most_faces
+            field, value, lattice_box, cell_size, side=side, most_faces=mesh_options.most_faces
         )
 
     is_intersection_free = False
@@ -386,33 +386,33 @@ def _mesh_from_signs(
         the level set that it lacks to `losses`, and `is_intersection_free` is set."""
         nonlocal is_intersection_free
         try:
-            made, lost, more = mesh_from_signs(
+            triangles, lost, more = mesh_from_signs(
                 function(value, side),
                 lattice_box,
                 cell_size,
-                asked.tolerance.at(size),
+                mesh_options.tolerance.at(size),
                 attempts,
-                asked.report,
+                mesh_options.report,
                 closed=closed,
-                volume=asked.volume,
+                volume=mesh_options.volume,
             )
         except EmptySurfaceError as error:
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
         facts.append(more)
         losses.append(lost)
         # The last mesh decides; with two levels this is set to False later.
-        is_intersection_free = made.is_intersection_free
-        return made.surface
+        is_intersection_free = triangles.is_intersection_free
+        return triangles.surface
 
     if not solid:
         # (False: the mesh may end at the box; parts of its faces do not close it.)
-        made = signed(levels[0], 1.0, False)
+        triangles = signed(levels[0], 1.0, False)
         if volume is not None and not (isinstance(volume, Box) and box.has_walls):
             # The box itself has cut the mesh already if the clip is a box.
-            made, is_intersection_free = clip_to_volume(made, volume), False
+            triangles, is_intersection_free = clip_to_volume(triangles, volume), False
     elif volume is None and ends[1] == math.inf:
         # Reversed, the faces look out of the solid of larger values.
-        made = signed(levels[0], -1.0, False)
+        triangles = signed(levels[0], -1.0, False)
     else:
         # Between two levels: the points below the upper level without those below the lower one.
         solid_so_far = box_manifold(box.lower, box.upper)
@@ -421,23 +421,25 @@ def _mesh_from_signs(
         if math.isfinite(ends[1]):
             solid_so_far = solid_so_far - to_manifold(signed(ends[1], -1.0, True))
         if field.jumps is not None and len(levels) == 2:
-            _check_has_thickness(field, solid_so_far, ends, asked.tolerance.at(size))
+            _check_has_thickness(field, solid_so_far, ends, mesh_options.tolerance.at(size))
         cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         solid_so_far ^= volume_manifold(
-            cut_volume, box.lower, box.upper, 0.5 * asked.tolerance.at(size)
+            cut_volume, box.lower, box.upper, 0.5 * mesh_options.tolerance.at(size)
         )
-        made, is_intersection_free = from_manifold(solid_so_far), False
-    if not len(made.faces):
+        triangles, is_intersection_free = from_manifold(solid_so_far), False
+    if not len(triangles.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
     if is_intersection_free:
-        check_manifold(made.faces)
+        check_manifold(triangles.faces)
     metadata = {"level": levels[0], **_merge_facts(facts)}
     if isinstance(field, DipolePotential):
         metadata["cloud"] = field.describe()
-    is_told = _check_sign_accuracy(field, metadata, asked.tolerance.at(size))
+    is_told = _check_sign_accuracy(field, metadata, mesh_options.tolerance.at(size))
     _warn_of_lost(field, losses, is_told)
     # No check of the level (`_accept`): distances from it have been measured.
-    return _RawMesh(made, size, metadata, function(levels[0], 1.0), _accept, is_intersection_free)
+    return _RawMesh(
+        triangles, size, metadata, function(levels[0], 1.0), _accept, is_intersection_free
+    )
 
 
 def _ends_by_signs(
@@ -488,14 +490,14 @@ def _faces_alone(
     field: WindingNumber,
     level: float,
     solid: tuple[float, float] | bool,
-    asked: _MeshOptions,
+    mesh_options: _MeshOptions,
 ) -> _RawMesh:
     """Mesh the level set of a `WindingNumber` whose open mesh lies on that level set, such as a
     mesh of a `SolidAngle`. The result consists of the triangles of that mesh, cut by the volume of
     the arguments and otherwise unchanged.
 
     level: the level. solid: must be False.
-    asked: the arguments of `mesh`.
+    mesh_options: the arguments of `mesh`.
 
     Raises:
         MeshingError: a solid was asked for, nothing is left, or there are too many triangles.
@@ -508,17 +510,17 @@ def _faces_alone(
     vertices, faces = field.mesh.vertices, field.mesh.faces
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max())
     surface = TriangleMesh.without_unused_vertices(vertices, faces)
-    if asked.volume is not None:
-        surface = clip_to_volume(surface, asked.volume)
+    if mesh_options.volume is not None:
+        surface = clip_to_volume(surface, mesh_options.volume)
     if not len(surface.faces):
         raise MeshingError("the level set is empty: it lies outside of the clip")
-    if len(surface.faces) > asked.most_faces:
+    if len(surface.faces) > mesh_options.most_faces:
         raise TriangleLimitError(
             f"{len(surface.faces):,} triangles of the mesh are its surface, and max_triangles is "
-            f"{asked.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
+            f"{mesh_options.most_faces:,}: choose a larger `max_triangles`, or a smaller `clip`"
         )
     facts = {"level": level, "made_by": "faces", "spacing": math.nan, "evaluations": 0}
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    function = LevelFunction(field, level, most_faces=mesh_options.most_faces)
     # No check of the level: the triangles are the level set. Other checks follow (False).
     return _RawMesh(surface, size, facts, function, _accept, False)
 
@@ -533,7 +535,7 @@ def _check_has_thickness(
     whole: the solid. ends: the two levels. tolerance: the smallest mean thickness, a length."""
     # A thin sheet of thickness h has the volume h * area / 2, as both of its sides count.
     if 2 * abs(whole.volume()) < tolerance * whole.surface_area():
-        low, high = (f"{one:g}" for one in ends)
+        low, high = (f"{end:g}" for end in ends)
         raise MeshingError(
             f"the part between the levels {low} and {high} of this {type(field).__name__} has no "
             f'thickness: it jumps across both at its triangles; for the inside give side="above"'
@@ -545,8 +547,8 @@ def _merge_facts(facts: list[dict[str, Any]]) -> dict[str, Any]:
     counts are added, and of two lengths the larger one is taken. facts: one dictionary for each
     level."""
     sums = ("evaluations", "undecided", "flat", "far", "looked_at", "lost", "sought")
-    larger = {key: max(one[key] for one in facts) for key in ("spacing", "within")}
-    return {**facts[0], **larger, **{key: sum(one[key] for one in facts) for key in sums}}
+    larger = {key: max(entry[key] for entry in facts) for key in ("spacing", "within")}
+    return {**facts[0], **larger, **{key: sum(entry[key] for entry in facts) for key in sums}}
 
 
 def _check_sign_accuracy(field: Field, facts: dict[str, Any], tolerance: float) -> bool:
@@ -633,14 +635,14 @@ def _level_and_solid(
 
 
 def _check_level(
-    function: LevelFunction, made: TriangleMesh, tolerance: float, volume: Volume | None
+    function: LevelFunction, triangles: TriangleMesh, tolerance: float, volume: Volume | None
 ) -> None:
-    """Raise a MeshingError unless the mesh `made` is within `tolerance` (a length) of the level set
-    of the function, and inside the volume if there is one. The distance is tested at vertices and
-    centers of triangles."""
+    """Raise a MeshingError unless the mesh `triangles` is within `tolerance` (a length) of the
+    level set of the function, and inside the volume if there is one. The distance is tested at
+    vertices and centers of triangles."""
     if volume is not None:
-        check_inside(made.vertices, volume, tolerance)
-    check_near_level(function, made.vertices, made.faces, tolerance, volume)
+        check_inside(triangles.vertices, volume, tolerance)
+    check_near_level(function, triangles.vertices, triangles.faces, tolerance, volume)
 
 
 def _checked(field: Field) -> Field:
@@ -677,7 +679,7 @@ def _mesh_solid(
     field: Field,
     level: float | None,
     solid: tuple[float, float] | Literal[True],
-    asked: _MeshOptions,
+    mesh_options: _MeshOptions,
 ) -> _RawMesh:
     """Mesh the closed surface of a solid: the smooth level sets of its parts are meshed and then
     combined by unions, intersections and differences.
@@ -685,8 +687,10 @@ def _mesh_solid(
     level: the level; None for the field's default.
     solid: True for the points of a `Solid`; or the interval (low, high) of the values of f in the
         solid.
-    asked: the arguments of `mesh`."""
-    region = LevelFunction(*solid_and_level(field, solid, level), most_faces=asked.most_faces)
+    mesh_options: the arguments of `mesh`."""
+    region = LevelFunction(
+        *solid_and_level(field, solid, level), most_faces=mesh_options.most_faces
+    )
     # In a list, so that a nested function can change it.
     angle_evaluations = [0]
 
@@ -699,20 +703,20 @@ def _mesh_solid(
             to `angle_evaluations`."""
             angle = cast("SolidAngle", _checked(angle))
             box = _box(angle, (value,), None)
-            function = LevelFunction(angle, value, most_faces=asked.most_faces)
+            function = LevelFunction(angle, value, most_faces=mesh_options.most_faces)
             # In a single attempt: the caller tries again with smaller cells.
-            made, facts = _mesh_spanning_curve(
-                function, box, error, cells, 1, asked.seed, asked.report
+            solid_mesh, facts = _mesh_spanning_curve(
+                function, box, error, cells, 1, mesh_options.seed, mesh_options.report
             )
             angle_evaluations[0] += facts["evaluations"]
-            return made
+            return solid_mesh
 
         return mesh_angle
 
     def check_level(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is within the tolerance of the solid's level set.
         size: the longest side of the solid's box, a length, to which the tolerance is relative."""
-        _check_level(region, surface, asked.tolerance.at(size), asked.volume)
+        _check_level(region, surface, mesh_options.tolerance.at(size), mesh_options.volume)
 
     def check(surface: TriangleMesh, size: float) -> None:
         """Raise a MeshingError unless the mesh is a manifold within the tolerance of the level set.
@@ -722,75 +726,82 @@ def _mesh_solid(
 
     solid_field = cast("Solid", region.field)
     with singular_points_explained(
-        field, region, lambda: solid_size(solid_field, region.level, asked.volume)
+        field, region, lambda: solid_size(solid_field, region.level, mesh_options.volume)
     ):
-        made = mesh_solid(
+        solid_mesh = mesh_solid(
             solid_field,
             region.level,
-            asked.volume,
-            asked.tolerance,
-            asked.spacing,
+            mesh_options.volume,
+            mesh_options.tolerance,
+            mesh_options.spacing,
             angle_mesher,
-            asked.most_faces,
+            mesh_options.most_faces,
             check,
-            asked.report,
+            mesh_options.report,
         )
     facts = {
         "level": region.level,
-        "spacing": made.spacing,
-        "evaluations": made.evaluations + angle_evaluations[0],
-        "surfaces_with_options": made.levels,
+        "spacing": solid_mesh.spacing,
+        "evaluations": solid_mesh.evaluations + angle_evaluations[0],
+        "surfaces_with_options": solid_mesh.levels,
     }
     # (True: `mesh_solid` has checked it.)
     return _RawMesh(
-        made.surface, made.size, facts, region, lambda one: check_level(one, made.size), True
+        solid_mesh.surface,
+        solid_mesh.size,
+        facts,
+        region,
+        lambda surface: check_level(surface, solid_mesh.size),
+        True,
     )
 
 
-def _mesh_level_set(field: Field, level: float | None, asked: _MeshOptions) -> _RawMesh:
+def _mesh_level_set(field: Field, level: float | None, mesh_options: _MeshOptions) -> _RawMesh:
     """Mesh a level set of a function that is smooth nearly everywhere, or of a `SolidAngle`, and
     cut it by the volume of the arguments.
 
     level: the level; None for the field's default.
-    asked: the arguments of `mesh`.
+    mesh_options: the arguments of `mesh`.
 
     Raises:
         MeshingError: the level set is empty or cannot be meshed.
     """
     level = field.default_level if level is None else float(level)
-    function = LevelFunction(field, level, most_faces=asked.most_faces)
+    function = LevelFunction(field, level, most_faces=mesh_options.most_faces)
     field.validate_levels((level,))
-    volume, report = asked.volume, asked.report
+    volume, report = mesh_options.volume, mesh_options.report
     box = _box(field, (level,), volume)
     size = float((box.upper - box.lower).max())
     # The other half of the tolerance is left for changes of the mesh that follow.
-    mesh_tolerance = 0.5 * asked.tolerance.at(size)
-    cell_size = size / _CELLS_ACROSS if asked.spacing is None else float(asked.spacing)
-    if asked.spacing is None and field.min_wavelength is not None:
+    mesh_tolerance = 0.5 * mesh_options.tolerance.at(size)
+    cell_size = (
+        size / _CELLS_ACROSS if mesh_options.spacing is None else float(mesh_options.spacing)
+    )
+    if mesh_options.spacing is None and field.min_wavelength is not None:
         cell_size = min(cell_size, field.min_wavelength / CELLS_PER_WAVE)
-    attempts = 1 if asked.spacing is not None else _MAX_ATTEMPTS
+    attempts = 1 if mesh_options.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
-        made, facts = _mesh_spanning_curve(
-            function, box, mesh_tolerance, cell_size, attempts, asked.seed, report
+        triangles, facts = _mesh_spanning_curve(
+            function, box, mesh_tolerance, cell_size, attempts, mesh_options.seed, report
         )
     else:
         with singular_points_explained(field, function, lambda: size):
-            made, facts = _mesh_in_lattice(
+            triangles, facts = _mesh_in_lattice(
                 function, box, mesh_tolerance, cell_size, attempts, report
             )
     # If the clip is a box, the lattice has ended the mesh there already.
     if volume is not None and not (isinstance(volume, Box) and box.has_walls):
-        made = clip_to_volume(made, volume)
-        if not len(made.faces):
+        triangles = clip_to_volume(triangles, volume)
+        if not len(triangles.faces):
             raise MeshingError("the level set is empty: it lies outside of the clip")
 
     def check_level(surface: TriangleMesh) -> None:
         """Raise a MeshingError unless the mesh is within the tolerance of the level set and in the
         volume."""
-        _check_level(function, surface, asked.tolerance.at(size), volume)
+        _check_level(function, surface, mesh_options.tolerance.at(size), volume)
 
     # (False: it is checked later, after it was cut and perhaps thickened.)
-    return _RawMesh(made, size, {"level": level, **facts}, function, check_level, False)
+    return _RawMesh(triangles, size, {"level": level, **facts}, function, check_level, False)
 
 
 def _mesh_in_lattice(
@@ -818,11 +829,11 @@ def _mesh_in_lattice(
         report(f"cells of {spacing:.3g}")
         try:
             lattice = BccLattice.covering_box(box.lower, box.upper, spacing)
-            made, isotopy = mesh_open_surface(function, lattice, tolerance, report)
-            check_manifold(made.faces, made.vertices)
+            triangles, isotopy = mesh_open_surface(function, lattice, tolerance, report)
+            check_manifold(triangles.faces, triangles.vertices)
             # (None: no volume has cut the mesh yet.)
-            check_near_level(function, made.vertices, made.faces, 2 * tolerance, None)
-            check_no_self_intersection(made.vertices, made.faces)
+            check_near_level(function, triangles.vertices, triangles.faces, 2 * tolerance, None)
+            check_no_self_intersection(triangles.vertices, triangles.faces)
             break
         except MeshingError as error:
             attempts -= 1
@@ -840,7 +851,7 @@ def _mesh_in_lattice(
         "integrated": 0,
         **isotopy.shares(),
     }
-    return made, facts
+    return triangles, facts
 
 
 def _mesh_spanning_curve(

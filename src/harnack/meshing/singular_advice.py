@@ -60,16 +60,16 @@ def _advice(field: Field, function: LevelFunction, places: FloatArray, size: flo
     point = singular_point(function, places, size)
     if point is None:
         return ""
-    found = (
+    reason = (
         f". The gradient of the function vanishes near {point_text(point)}: the surface may touch "
         "or cross itself there, and"
     )
     if isinstance(field, Lobes):
         return (
-            f"{found} lobes of both signs meet in the origin: mesh `lobes.positive` and "
+            f"{reason} lobes of both signs meet at the origin: mesh `lobes.positive` and "
             "`lobes.negative`, one by one, or choose a level below this one"
         )
-    return f"{found} smaller cells do not help: choose a level beside this one, or {walls}"
+    return f"{reason} smaller cells do not help: choose a level beside this one, or {walls}"
 
 
 def singular_point(function: LevelFunction, places: FloatArray, size: float) -> FloatArray | None:
@@ -87,7 +87,7 @@ def singular_point(function: LevelFunction, places: FloatArray, size: float) -> 
         step = _newton_step(function, points, 1e-4 * size)
         shrink = np.minimum(1.0, near / np.maximum(row_norms(step), 1e-300))
         points = points + step * shrink[:, None]
-    found = function.sample(points)
+    samples = function.sample(points)
     # The median slope at some points at that distance.
     directions = np.concatenate([np.eye(3), -np.eye(3)])
     around = (start[:, None] + near * directions).reshape(-1, 3)
@@ -95,8 +95,8 @@ def singular_point(function: LevelFunction, places: FloatArray, size: float) -> 
     slope = np.median(slopes, axis=1)
     is_singular = (
         (row_norms(points - start) <= near)
-        & (row_norms(found.gradient) <= _VANISHES * slope)
-        & (np.abs(found.value) <= _VANISHES * slope * near)
+        & (row_norms(samples.gradient) <= _VANISHES * slope)
+        & (np.abs(samples.value) <= _VANISHES * slope * near)
         & (slope > 0)
     )
     return points[np.flatnonzero(is_singular)[0]] if is_singular.any() else None

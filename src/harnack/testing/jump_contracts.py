@@ -150,18 +150,18 @@ def _next_crossings(
     there is no crossing."""
     backend = choose_backend("double")
     n = len(rays.o)
-    found = jumps.next_crossing(
+    crossing = jumps.next_crossing(
         to_vector3(backend, rays.o),
         to_vector3(backend, rays.d),
         after.on_device(),
         backend.Float(np.ascontiguousarray(t_max)),
         backend.Bool(np.ascontiguousarray(active)),
     )
-    normal = np.broadcast_to(to_numpy(backend.Array3f(*found.normal)), (n, 3))
+    normal = np.broadcast_to(to_numpy(backend.Array3f(*crossing.normal)), (n, 3))
     return _Crossings(
-        np.where(active, to_lanes(found.t, n), np.inf),
-        np.where(active, to_lanes(found.facet, n), NO_FACET).astype(np.int64),
-        np.where(active, to_lanes(found.jump, n), 0.0),
+        np.where(active, to_lanes(crossing.t, n), np.inf),
+        np.where(active, to_lanes(crossing.facet, n), NO_FACET).astype(np.int64),
+        np.where(active, to_lanes(crossing.jump, n), 0.0),
         np.where(active[:, None], normal, rays.d),
     )
 
@@ -230,7 +230,7 @@ def _check_restart(
     """
     low, high = np.sort(rng.uniform(rays.start, rays.end, (2, len(rays.o))), axis=0)
     active = np.full(len(low), True)
-    found = _next_crossings(jumps, rays, _starts(rays, low), high, active)
+    restarted = _next_crossings(jumps, rays, _starts(rays, low), high, active)
     # Later crossings are overwritten by earlier ones.
     t, facet, jump = np.full(len(low), np.inf), np.full(len(low), NO_FACET), np.zeros(len(low))
     for known in reversed(crossings[1:]):
@@ -241,7 +241,7 @@ def _check_restart(
         f"{type(jumps).__name__}.next_crossing: t, facet or jump depend on where the search begins "
         "and ends"
     )
-    is_same = (found.t == t) & (found.facet == facet) & (found.jump == jump)
+    is_same = (restarted.t == t) & (restarted.facet == facet) & (restarted.jump == jump)
     require(is_same, message, rays.point(low))
 
 
@@ -324,7 +324,9 @@ def _concatenate(parts: list[_Intervals]) -> _Intervals:
 
     def joined(records: Any, names: str) -> list[Any]:
         """The attributes with these names, each of all records in one array."""
-        return [np.concatenate([getattr(one, name) for one in records]) for name in names.split()]
+        return [
+            np.concatenate([getattr(record, name) for record in records]) for name in names.split()
+        ]
 
     return _Intervals(
         _Rays(*joined(rays, "o d start end")),

@@ -336,28 +336,30 @@ def trace_crossings(
     prepared = surface.prepare(backend, crosses=True)
     with dr.suspend_grad():
         detached_o, detached_d, near, far = (dr.detach(array) for array in rays.arrays)
-        found = find_crossings(prepared, detached_o, detached_d, near, far, k)
-        is_found = dr.isfinite(found.t)
-        length = norm(found.gradient)
-        normal = dr.select(length > 0, found.gradient / length, 0)
-        dr.eval(*vars(found).values(), normal)
-    ray = dr.arange(backend.UInt32, dr.width(found.t)) // k
+        arrays = find_crossings(prepared, detached_o, detached_d, near, far, k)
+        is_found = dr.isfinite(arrays.t)
+        length = norm(arrays.gradient)
+        normal = dr.select(length > 0, arrays.gradient / length, 0)
+        dr.eval(*vars(arrays).values(), normal)
+    ray = dr.arange(backend.UInt32, dr.width(arrays.t)) // k
     o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
-    t, end = found.t, found.end
+    t, end = arrays.t, arrays.end
     if differentiable and needs_derivatives(prepared, o, d):
         with dr.suspend_grad():
             # The crossings as if each were the end of a ray of its own. The attributes that are
             # zero (`value`, `tolerance_excess` and `evaluations`) are not used.
             status = dr.select(is_found, backend.UInt32(int(RayStatus.HIT)), int(RayStatus.MISS))
             zero = dr.zeros(backend.Float, dr.width(t))
-            ends = MarchResult(t, zero, found.gradient, zero, zero, status, found.sheet, found.side)
+            ends = MarchResult(
+                t, zero, arrays.gradient, zero, zero, status, arrays.sheet, arrays.side
+            )
         t, normal = attach_derivatives(prepared, o, d, ends, normal)
         normal = refuse_derivative(prepared, o, d, "normal", normal)
         end = refuse_derivative(prepared, o, d, "traced_to", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
-    side = backend.Int32(found.side)
-    index = dr.reinterpret_array(backend.Int32, found.sheet)  # NO_FACET becomes -1
-    ray_results = found.count, end, found.status, found.evaluations
+    side = backend.Int32(arrays.side)
+    index = dr.reinterpret_array(backend.Int32, arrays.sheet)  # NO_FACET becomes -1
+    ray_results = arrays.count, end, arrays.status, arrays.evaluations
     hits = RayCrossings(t, position, normal, index, side, *ray_results)
     dr.eval(*vars(hits).values())
     return hits
