@@ -26,6 +26,7 @@ import drjit as dr
 
 from harnack.arithmetic.angles import angle_range
 from harnack.arithmetic.interval import Interval, machine_epsilon
+from harnack.arithmetic.norms import as_backend_interval
 from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.literature.blob_kernel import ClippedPower
@@ -328,13 +329,13 @@ class ParabolaBounds(FormulaNumber):
         s^2 times the squares of the slopes of f's own chords.
         """
         if self.polynomial_degree == 0:
-            value = function.ranges(_on_backend(self.value, self.piece_length))[0]
+            value = function.ranges(as_backend_interval(self.value, self.piece_length))[0]
             return self._new(value, (0.0, 0.0), (0.0, 0.0), 0)
         if isinstance(function, ClippedPower) and self.polynomial_degree is not None:
             return self._clipped_power(function)
         lower, upper = self.bounds
         h = self.piece_length
-        start = _on_backend(self.value, h)
+        start = as_backend_interval(self.value, h)
         min_change, max_change = -_maximum_on_piece(_negate(lower), h), _maximum_on_piece(upper, h)
         # At f(0), and on the range of f.
         value, slope, _ = function.ranges(start)
@@ -454,7 +455,7 @@ class ParabolaBounds(FormulaNumber):
         is known beyond the start: the bounds are infinite.
         """
         h = self.piece_length
-        v, u = (_on_backend(bounds.value, h) for bounds in (self, x))
+        v, u = (as_backend_interval(bounds.value, h) for bounds in (self, x))
         value, _ = angle_range(v, u)
         relative, is_valid, _, _ = relative_angle(self, x, v.midpoint, u.midpoint)
         zero = 0 * h
@@ -469,7 +470,7 @@ class ParabolaBounds(FormulaNumber):
         """The range of the function on the whole path: its value at s = 0 plus the extremes of the
         two parabolas."""
         # How far the function may fall below its value at the start, and rise above it.
-        h, value = self.piece_length, _on_backend(self.value, self.piece_length)
+        h, value = self.piece_length, as_backend_interval(self.value, self.piece_length)
         max_fall, max_rise = (
             _maximum_on_piece(_negate(self.lower), h),
             _maximum_on_piece(self.upper, h),
@@ -544,7 +545,7 @@ class ParabolaBounds(FormulaNumber):
             2,
         )._power_by_squaring(n)
         # The value at s = 0, and the bounds on all of [0, h].
-        value, _, _ = function.ranges(_on_backend(self.value, h))
+        value, _, _ = function.ranges(as_backend_interval(self.value, h))
         outer_slope = n * (2 * value_error) ** (n - 1) * (dr.abs(a) + ra + 2 * (dr.abs(b) + rb) * h)
         is_cut = (start > 0) | (end < h)
         if self.bound_degree == 1:
@@ -830,16 +831,6 @@ def _radius(x: Interval) -> Real:
         return 0.0
     radius = x.radius
     return radius if isinstance(radius, float) else radius + _rounding_bound(dr.abs(x.midpoint))
-
-
-def _on_backend(x: Interval, like: Real) -> Interval:
-    """The interval x with Dr.Jit numbers as its ends: if they are Python numbers, they are
-    converted to the type of `like`."""
-    if not x.is_literal:
-        return x
-    kind = cast("Any", type(like))
-    low = kind(x.lower)
-    return Interval(low, low if x.lower == x.upper else kind(x.upper))
 
 
 def _is_zero(x: Real) -> bool:
