@@ -23,7 +23,7 @@ from .capabilities import (
     VariableAccuracy,
 )
 from .expressions import expression
-from .field import EvaluateOnly, Field, Sample
+from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator
 from .formula import Formula
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
@@ -43,6 +43,7 @@ __all__ = [
     "DipolePotential",
     "EigenfunctionSum",
     "EvaluateOnly",
+    "Evaluator",
     "Field",
     "Formula",
     "FormulaSolid",
@@ -60,10 +61,12 @@ __all__ = [
     "NearestFacet",
     "PatchEntry",
     "Patches",
+    "Plan",
     "PlaneWave",
     "PolygonMesh",
     "RiemannSurface",
     "Sample",
+    "SampleEvaluator",
     "SchwarzD",
     "SchwarzP",
     "ScreenedWindingNumber",

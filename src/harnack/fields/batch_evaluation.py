@@ -92,7 +92,7 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
 
         def kernel(backend: Backend, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:
             """The three rows of the Hessian at the Dr.Jit points x."""
-            return self.prepare(backend).hessian(x)
+            return self.evaluator(backend).hessian(x)
 
         # Three arrays of rows (n, 3) become matrices (n, 3, 3).
         return np.stack(evaluate_points(p, kernel, precision), axis=-2)

@@ -20,6 +20,7 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
+from harnack.backend import backend_of
 from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.tensors import accepts_tensors
 from harnack.backend.validation import (
@@ -33,6 +34,7 @@ from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
+from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.parameters import Parametrized, record_call
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import with_article
@@ -49,12 +51,15 @@ if TYPE_CHECKING:
 __all__ = [
     "BoundedLaplacian",
     "EvaluateOnly",
+    "Evaluator",
     "Field",
     "HarmonicBall",
     "Lipschitz",
+    "Plan",
     "Ray",
     "RaySample",
     "Sample",
+    "SampleEvaluator",
     "TaylorRemainder",
     "space_scaled",
 ]
@@ -156,6 +161,11 @@ class Field(Parametrized, abc.ABC):
             cls.evaluate = checked
             if "sample_ray" not in vars(cls):  # a base's might not call this `evaluate`
                 cls.sample_ray = Field.sample_ray
+            if "evaluator" not in vars(cls):  # a base's might not call this `evaluate`
+                cls.evaluator = Field.evaluator
+        elif "evaluator" in vars(cls):
+            evaluate_by: Any = _evaluate_by(cls.evaluator)
+            cls.evaluate = evaluate_by
         if "hessian" in vars(cls):
             general: Any = accepts_numpy_points(cls.hessian)
             cls.hessian = general
@@ -220,25 +230,41 @@ class Field(Parametrized, abc.ABC):
         branches on its values.
         """
 
-    def prepare(self, backend: Backend) -> Field:
-        """A field equal to this one whose data lie on the backend. Each function of the library
-        calls this method once, before a kernel is recorded, because nothing can be uploaded during
-        the recording.
+    def prepare(self, backend: Backend) -> Any:
+        """(Until all families of fields define `evaluator`.)"""
+        if type(self).evaluator is not Field.evaluator:
+            return self.evaluator(backend)
+        return self
 
-        The default is for fields that hold only Python numbers, and for user-defined fields that
-        hold other fields. It prepares fields that are attributes, or entries of attributes that are
-        lists or tuples. If there are none, it returns the field itself.
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The object that samples f on a backend (a Dr.Jit device and precision): `Evaluator`. It
+        holds the data that are needed there. Each function of the library makes it once, before a
+        kernel is recorded, because nothing can be uploaded during the recording.
+
+        plan: what the evaluator will be used for (`Plan`).
+
+        The default is for fields that define `evaluate`, which it calls (`SampleEvaluator`).
         """
-        # The library's own fields define `prepare` where they need it.
         if type(self).__module__.startswith("harnack."):
-            return self
-        attributes = {name: _prepared(value, backend) for name, value in vars(self).items()}
-        if all(value is vars(self)[name] for name, value in attributes.items()):
-            return self
-        prepared = copy.copy(self)
-        for name, value in attributes.items():
-            object.__setattr__(prepared, name, value)  # also of frozen dataclasses
-        return prepared
+            ready: Any = self.for_ray_count(plan.ray_count)
+            return ready.with_levels(plan.levels).prepare(backend)
+        return SampleEvaluator(self, backend)
+
+    @property
+    def has_jumps(self) -> bool:
+        """Whether f jumps across facets. Then `Evaluator.jumps` is an object."""
+        return self.jumps is not None
+
+    @property
+    def has_patches(self) -> bool:
+        """Whether the surface is a union of patches. Then `Evaluator.patches` is an object."""
+        return self.patches is not None
+
+    @property
+    def has_variable_accuracy(self) -> bool:
+        """Whether f can be sampled with different accuracy. Then `Evaluator.variable_accuracy` is
+        an object."""
+        return self.variable_accuracy is not None
 
     @property
     def jumps(self) -> Jumps | None:
@@ -327,20 +353,6 @@ class Field(Parametrized, abc.ABC):
         levels."""
         del levels
 
-    def refuse_hidden_parameters(self) -> None:
-        """Raise NotImplementedError if the field holds numbers with derivatives enabled, for
-        example in its formula, and these derivatives would be lost. They would be lost if the class
-        does not have `has_parameter_derivatives`; or, for a user's class, if none of the field's
-        `parameters` has derivatives enabled."""
-        kind = type(self)
-        # The `evaluate` of a user's class may refer to such numbers, too.
-        is_own = not kind.__module__.startswith("harnack.")
-        if self.has_parameter_derivatives and (
-            not is_own or any(map(dr.grad_enabled, self.differentiable_parameters()))
-        ):
-            return
-        check_no_derivatives(kind.__name__, vars(self), kind.evaluate if is_own else None)
-
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's
         parameters.
@@ -353,7 +365,7 @@ class Field(Parametrized, abc.ABC):
         """
         if any(dr.grad_enabled(parameter) for parameter in self.differentiable_parameters()):
             return self.evaluate(p).value
-        self.refuse_hidden_parameters()
+        refuse_hidden_parameters(self)
         at = dr.detach(p)
         with dr.suspend_grad():
             sample = self.evaluate(at)
@@ -380,7 +392,7 @@ class Field(Parametrized, abc.ABC):
         Raises TypeError or ValueError for other shapes, NaN or infinity.
         """
         if dr.is_array_v(type(points)):
-            self.refuse_hidden_parameters()
+            refuse_hidden_parameters(self)
             if any(dr.grad_enabled(array) for array in (points, *self.differentiable_parameters())):
                 return self.differentiable_value(points)
             return self.evaluate(points).value
@@ -400,7 +412,7 @@ class Field(Parametrized, abc.ABC):
         """
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
-        self.refuse_hidden_parameters()
+        refuse_hidden_parameters(self)
         check_no_derivatives(
             f"the gradient of {type(self).__name__}", self.differentiable_parameters()
         )
@@ -428,7 +440,7 @@ class Field(Parametrized, abc.ABC):
         def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
             """The number or vector that `choose` takes from the samples at the Dr.Jit points x, in
             a tuple of one entry."""
-            return (choose(self.prepare(backend).evaluate(x)),)
+            return (choose(self.evaluator(backend).evaluate(x)),)
 
         return evaluate_points(points, kernel, precision)[0]
 
@@ -441,11 +453,7 @@ class Field(Parametrized, abc.ABC):
         Dr.Jit 3-vectors. It can then also be called with points (n, 3) or (3,), and with
         `precision` as for `value`, and gives (n, 3, 3) or (3, 3).
         """
-        del p
-        raise NotImplementedError(
-            f"{type(self).__name__} gives no second derivatives: define its method hessian(p), or "
-            'ask for what needs none, such as signed_distance(..., method="first_order")'
-        )
+        return self.evaluator(backend_of(p)).hessian(p)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at the point p of a sample: of the gradient, as a length, and of
@@ -478,27 +486,103 @@ class Field(Parametrized, abc.ABC):
         return path.enclose(self.evaluate(path.point(t)))
 
 
-class EvaluateOnly(Field):
-    """A field that consists of its method `evaluate` only. It is the simplest result of
-    `VariableAccuracy.at` and of `Jumps.continuation`, which are called for a field that is prepared
-    already: `prepare` does nothing here. What the function uses of other fields must be on the
-    backend on which it is called.
+def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[Any, Vec3], Sample]:
+    """The method `evaluate` of a class of fields that defines `evaluator`."""
 
-    evaluate: a function that takes a point p, a Dr.Jit 3-vector, and returns the `Sample` there.
+    def evaluate(self: Any, p: Vec3) -> Sample:
+        """The sample at p, by the evaluator of the class that was wrapped."""
+        return evaluator(self, backend_of(p)).evaluate(p)
 
-    Raises TypeError if it is not a function.
+    return evaluate
+
+
+class SampleEvaluator(Evaluator):
+    """The evaluator of a field whose class defines `evaluate`. Fields that are attributes of the
+    field, or entries of attributes that are lists or tuples, are made ready for the backend, too:
+    within `evaluate`, self.inner.evaluate(p) uses data on the backend.
+
+    field: the field. The attribute `field` is a copy of it if fields are among its attributes.
+    backend: the backend.
+    jumps, modulo_one, patches, variable_accuracy, is_steep: what else f can do, as of `Evaluator`.
+
+    Fields with second derivatives, or with enclosures of their own along rays, define a subclass
+    with `hessian` or `sample_ray`, and return it from `Field.evaluator`.
     """
 
-    def __init__(self, evaluate: Callable[[Vec3], Sample]) -> None:
-        if not callable(evaluate):
-            raise TypeError(
-                "evaluate must be a function that takes a Dr.Jit 3-vector and returns a "
-                f"harnack.fields.Sample, not {evaluate!r}"
-            )
-        self._evaluate = evaluate
+    def __init__(
+        self,
+        field: Field,
+        backend: Backend,
+        *,
+        jumps: Jumps | None = None,
+        modulo_one: ModuloOne | None = None,
+        patches: Patches | None = None,
+        variable_accuracy: VariableAccuracy | None = None,
+        is_steep: bool = False,
+    ) -> None:
+        self.field = _with_ready_fields(field, backend)
+        self.jumps, self.modulo_one, self.patches = jumps, modulo_one, patches
+        self.variable_accuracy, self.is_steep = variable_accuracy, is_steep
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self._evaluate(p)
+        return self.field.evaluate(p)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        raise NotImplementedError(
+            f"{type(self.field).__name__} gives no second derivatives: let its method evaluator "
+            "return a subclass of harnack.fields.SampleEvaluator that defines hessian(p), or ask "
+            'for what needs none, such as signed_distance(..., method="first_order")'
+        )
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        if any(map(dr.grad_enabled, self.field.differentiable_parameters())):
+            return self.evaluate(p).value
+        refuse_hidden_parameters(self.field)
+        return super().differentiable_value(p)
+
+
+def refuse_hidden_parameters(field: Field) -> None:
+    """Raise NotImplementedError if a field holds numbers with derivatives enabled, for example in
+    its formula, and these derivatives would be lost. They would be lost if its class does not have
+    `has_parameter_derivatives`; or, for a user's class, if none of the field's `parameters` has
+    derivatives enabled."""
+    kind = type(field)
+    # The `evaluate` of a user's class may refer to such numbers, too.
+    is_users = not kind.__module__.startswith("harnack.")
+    if field.has_parameter_derivatives and (
+        not is_users or any(map(dr.grad_enabled, field.differentiable_parameters()))
+    ):
+        return
+    check_no_derivatives(kind.__name__, vars(field), kind.evaluate if is_users else None)
+
+
+def _with_ready_fields(field: Field, backend: Backend) -> Field:
+    """The field, or a copy of it in which each field among its attributes is `_ready`."""
+    ready = {name: _ready_in(value, backend) for name, value in vars(field).items()}
+    if all(value is vars(field)[name] for name, value in ready.items()):
+        return field
+    other = copy.copy(field)
+    for name, value in ready.items():
+        object.__setattr__(other, name, value)  # also of frozen dataclasses
+    return other
+
+
+def _ready_in(value: Any, backend: Backend) -> Any:
+    """The value of a field's attribute, where each field in it is `_ready`. Fields are found if
+    they are the value itself or entries of a list or tuple. If there are none, the same object is
+    returned."""
+    if isinstance(value, Field):
+        return _ready(value, backend)
+    if type(value) in (list, tuple) and any(isinstance(entry, Field) for entry in value):
+        return type(value)(_ready_in(entry, backend) for entry in value)
+    return value
+
+
+def _ready(field: Field, backend: Backend) -> Field:
+    """A copy of a field whose method `evaluate` is that of its evaluator on a backend."""
+    other = copy.copy(field)
+    object.__setattr__(other, "evaluate", field.evaluator(backend).evaluate)
+    return other
 
 
 def validate_levels_in_range(
@@ -516,17 +600,6 @@ def validate_levels_in_range(
             raise ValueError(
                 f"no surface has level {level:g}: {name} stays within [{lower:.6g}, {upper:.6g}]"
             )
-
-
-def _prepared(value: Any, backend: Backend) -> Any:
-    """The value of a field's attribute, where each field in it is prepared for the backend. Fields
-    are found if they are the value itself or entries of a list or tuple. If there are none, the
-    same object is returned."""
-    if isinstance(value, Field):
-        return value.prepare(backend)
-    if type(value) in (list, tuple) and any(isinstance(entry, Field) for entry in value):
-        return type(value)(_prepared(entry, backend) for entry in value)
-    return value
 
 
 def check_is_field(value: Any) -> None:
