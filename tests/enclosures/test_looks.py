@@ -131,7 +131,7 @@ def test_enclosures_hold_along_the_path_in_both_directions() -> None:
     t, ahead, back = (rng.uniform(0, high, 600) for high in (2.5, 1.5, 1.0))
     path = RayPath(to_vector3(backend, o), to_vector3(backend, d), choose_enclosures(None))
     field = TaylorBlobs()
-    look = field.sample_ray(path, real(t), real(ahead), real(back))
+    look = field.evaluator(backend).sample_ray(path, real(t), real(ahead), real(back))
     closest = np.inf
     for enclosure, sign, length in ((look.forward[-1], 1, ahead), (look.backward[-1], -1, back)):
         assert isinstance(enclosure, ParabolaEnclosure)
