@@ -63,6 +63,7 @@ from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     import numpy.typing as npt
 
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
@@ -130,7 +131,8 @@ class SolidAngle(FieldWithCells):
         number of edges. Where the result depends on the remainder, all edges are summed. None
         builds cells where they save time (`cells_pay_from`), True always, False never. They take
         some 2 to 10 MB, at most the number of megabytes of this argument (True: 256). If that is
-        too small, there are no cells, and `describe` of an evaluator reports this. They are built at the first trace, for each precision, which takes as long as tracing some 200,000 to
+        too small, there are no cells, and `describe` of an evaluator reports this. They are built
+        at the first trace, for each precision, which takes as long as tracing some 200,000 to
         600,000 camera rays without cells. Circles have no cells. Values and derivatives at points
         are those of all edges.
 
@@ -273,11 +275,16 @@ class SolidAngle(FieldWithCells):
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> CurveEvaluator:
         cells = self._cell_choice(plan.ray_count)
-        return CurveEvaluator(self, self._upload(backend, traced=True, cells=cells))
+        return self._evaluator_of(self._upload(backend, traced=True, cells=cells))
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of f at points p, from all edges."""
-        return CurveEvaluator(self, self._point_data(backend_of(p))).evaluate(p)
+        return self._evaluator_of(self._point_data(backend_of(p))).evaluate(p)
+
+    def _evaluator_of(self, data: _CurveData) -> CurveEvaluator:
+        """The evaluator that samples f by these data of the curve on a backend."""
+        # If vertices can move one by one, all edges are summed: after a move they may not cancel.
+        return CurveEvaluator(self, data, self._differentiable_loops or self._net_loops)
 
     def _point_data(self, backend: Backend) -> _CurveData:
         """The curve on a backend for values at points, which come from all edges."""
@@ -341,6 +348,8 @@ class SolidAngle(FieldWithCells):
             plane,
             dr.opaque(backend.Float, backend.machine_epsilon * (6 + 2 * magnitude)),
             dr.opaque(backend.Float, value_rounding),
+            self._region,
+            len(self._net_circles),
             curve_cells,
             cells,
         )
@@ -508,14 +517,17 @@ class CurveEvaluator(Evaluator):
 
     field: the field.
     data: the curve on the backend.
+    loops: the polygons of which derivatives by vertices are computed.
     detail: the accuracy scale of samples; larger is more accurate. At scales up to 1 samples come
         from FMM cells, if there are any, and at larger ones from all edges.
     """
 
-    def __init__(self, field: SolidAngle, data: _CurveData, detail: Real = 1.0) -> None:
-        self.field, self.data, self.detail = field, data, detail
+    def __init__(
+        self, field: SolidAngle, data: _CurveData, loops: tuple[Any, ...], detail: Real = 1.0
+    ) -> None:
+        self.field, self.data, self.loops, self.detail = field, data, loops, detail
         if data.cells is not None:
-            at = functools.partial(CurveEvaluator, field, data)
+            at = functools.partial(CurveEvaluator, field, data, loops)
             self.variable_accuracy = VariableAccuracy(at)
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -533,7 +545,7 @@ class CurveEvaluator(Evaluator):
             wanted. They are not used: the bounds state their own lengths.
         """
         del ahead, back
-        has_line_bounds = not self.field._all_cancel and self.field.lift_bound_option != "paper"
+        has_line_bounds = not self.data.is_empty and self.field.lift_bound_option != "paper"
         direction = path.direction if has_line_bounds else None
         return path.enclose(self._sample(path.point(t), direction))
 
@@ -546,7 +558,7 @@ class CurveEvaluator(Evaluator):
             this direction; None for no such bounds.
         """
         data = self.data
-        if self.field._all_cancel:
+        if data.is_empty:
             return self._zero_sample(p)
         x = data.to_unit(p)
         sums, errors = data.at_detail(x, self.detail)
@@ -583,9 +595,7 @@ class CurveEvaluator(Evaluator):
             # gradient near the circle (10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
             # `value` is the bound for the angle.
-            value = (
-                16 * epsilon * len(self.field._net_circles) + point_error * circles.inverse_squares
-            )
+            value = 16 * epsilon * data.circle_count + point_error * circles.inverse_squares
             error = error + dr.select(is_on_curve, 0, value)
             circle_gradient_error = (
                 32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
@@ -621,13 +631,13 @@ class CurveEvaluator(Evaluator):
         distance: a lower bound of the distance from x to the curve, in unit coordinates.
         error: a bound of the truncation error of f.
         """
-        data, region = self.data, self.field._region
-        if region is None:
+        data = self.data
+        if data.region is None:
             circles = sums.circles
             assert circles is not None
             return HarmonicBall(distance, circles.lower, circles.upper)
         height_rounding = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
-        return region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
+        return data.region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
 
     def _zero_sample(self, p: Vec3) -> Sample:
         """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
@@ -645,7 +655,7 @@ class CurveEvaluator(Evaluator):
         """The Hessian of f at points p, as three vectors: its rows. Its trace is 0 up to rounding.
         Its entries grow without limit towards the curve."""
         data = self.data
-        if self.field._all_cancel:
+        if data.is_empty:
             zero = dr.zeros(data.backend.Array3f, dr.width(p))
             return zero, zero, zero
         x, scale = data.to_unit(p), 1 / (data.size * data.size)
@@ -672,7 +682,7 @@ class CurveEvaluator(Evaluator):
         """
         del sample
         data = self.data
-        if self.field._all_cancel:
+        if data.is_empty:
             return 0.0, 0.0
         x = data.to_unit(p)
         sums, unit = data.sums(x), coordinate_rounding(x)
@@ -692,7 +702,7 @@ class CurveEvaluator(Evaluator):
         """A proved bound of |grad f(q) - grad f(p)| for all points q within the distance `radius`
         of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
         data = self.data
-        if self.field._all_cancel:
+        if data.is_empty:
             return 0 * p.x  # f is constant: 0 on each lane
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
@@ -707,9 +717,7 @@ class CurveEvaluator(Evaluator):
         """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
         the vertices of loops."""
         backend = backend_of(p)
-        # If vertices can move one by one, all edges are summed: after a move they may not cancel.
-        loops = self.field._differentiable_loops or self.field._net_loops
-        angle = differentiable_angle(backend, loops, p)
+        angle = differentiable_angle(backend, self.loops, p)
         data = self.data
         if data.circles is None:
             return angle
@@ -739,6 +747,8 @@ class _CurveData(UnitFrame):
         rounded once, at the curve's distance from 0.
     value_rounding: a bound of the rounding of the solid angle, which depends on the number of edges
         (`LoopEdges.rounding`).
+    region: that region; None if there is none.
+    circle_count: the number of circles.
     cells: the FMM cells, each with its near edges and a polynomial for all other edges; None for no
         cells.
     cell_choice: the cells that the curve was to have.
@@ -749,8 +759,15 @@ class _CurveData(UnitFrame):
     plane: tuple[Real, ...] | None
     rounding: Real
     value_rounding: Real
-    cells: CurveCells | None = None
-    cell_choice: CellChoice = NO_CELLS
+    region: PlanarRegion | None
+    circle_count: int
+    cells: CurveCells | None
+    cell_choice: CellChoice
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether all edges and circles cancel each other, so that f is 0 everywhere."""
+        return self.edges is None and self.circles is None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
         """Return the sums over all edges and circles at points x in unit coordinates, and bounds of
