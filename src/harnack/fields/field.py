@@ -363,6 +363,8 @@ class Field(Parametrized, abc.ABC):
         equal). A field with parameters overrides this method if `evaluate` cannot be differentiated
         in both modes.
         """
+        if type(self).evaluator is not Field.evaluator:
+            return self.evaluator(backend_of(p)).differentiable_value(p)
         if any(dr.grad_enabled(parameter) for parameter in self.differentiable_parameters()):
             return self.evaluate(p).value
         refuse_hidden_parameters(self)
