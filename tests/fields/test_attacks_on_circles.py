@@ -31,8 +31,8 @@ def test_windows_far_above_small_circles_hold() -> None:
     )
     x = x.astype(np.float32).astype(np.float64)
     backend = choose_backend("single")
-    field = hk.SolidAngle([big, small]).prepare(backend)
-    sample = field.evaluate(to_vector3(backend, x, "points"))
+    evaluator = hk.SolidAngle([big, small]).evaluator(backend)
+    sample = evaluator.evaluate(to_vector3(backend, x, "points"))
     value = to_numpy(sample.value).astype(float)
     balls = [one for one in sample.all_promises if isinstance(one, HarmonicBall)]
     assert len(balls) == 1

@@ -204,7 +204,7 @@ def test_contracts(name: str) -> None:
 
 def sample_at(field: hk.SolidAngle, x: Any, precision: Any = "double") -> Any:
     backend = choose_backend(precision)
-    return field.prepare(backend).evaluate(to_vector3(backend, x))
+    return field.evaluator(backend).evaluate(to_vector3(backend, x))
 
 
 @pytest.mark.few(2)
@@ -257,9 +257,10 @@ def test_lifts_stay_in_the_range_promised(name: str, precision: Any) -> None:
 
 def sums_over(field: hk.SolidAngle, x: np.ndarray) -> Any:
     """The sums over a field's circles, in its unit coordinates."""
-    p = to_vector3(choose_backend("double"), x)
-    on = field.prepare(choose_backend("double"))._data_for(p)  # type: ignore[attr-defined]
-    return on.circles.sums(on.to_unit(p))
+    backend = choose_backend("double")
+    on = field.evaluator(backend).data
+    assert on.circles is not None
+    return on.circles.sums(on.to_unit(to_vector3(backend, x)))
 
 
 def test_the_gradient_s_bound_is_attained_at_the_center() -> None:

@@ -15,6 +15,8 @@ import pytest
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
 from harnack.backend.record_table import RecordTable
+from harnack.fields.evaluator import POINTS, Plan
+from harnack.fields.solid_angles.cell_options import NO_CELLS
 from harnack.fmm import curve_cell_builder
 from harnack.fmm.edge_expansion import (
     _TERM_ROUNDING,  # pyright: ignore[reportPrivateUsage]
@@ -111,7 +113,7 @@ def test_far_loops_are_polynomials(q: float) -> None:
     for n in (3, 7, 40):
         loop = unit(np.cumsum(rng.normal(size=(n, 3)), axis=0) + 4 * rng.normal(size=3))
         backend = choose_backend("double")
-        curve = hk.SolidAngle(loop).prepare(backend)
+        curve = hk.SolidAngle(loop)
         nearest = curve.boundary.closest_point(backend.Array3f(0.0))
         radius = q * float(to_numpy(dr.norm(nearest))[0])
         found = expanded(loop, [*range(n)], [*range(1, n), 0], radius)
@@ -232,9 +234,9 @@ def places(curve: Any, n: int, seed: int) -> np.ndarray:
     return x.astype(np.float32).astype(np.float64)
 
 
-def sampled(field: hk.SolidAngle, x: np.ndarray, precision: Precision) -> Any:
+def sampled(field: hk.SolidAngle, x: np.ndarray, precision: Precision, plan: Plan = POINTS) -> Any:
     backend = choose_backend(precision)
-    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    sample = field.evaluator(backend, plan).evaluate(to_vector3(backend, x))
     numbers = (
         sample.value,
         sample.gradient,
@@ -275,9 +277,8 @@ def test_errors_are_bounded(name: str, precision: Precision) -> None:
 
 
 def table_of(field: hk.SolidAngle, precision: Precision = "single") -> tuple[Any, np.ndarray]:
-    """The cells of a prepared field, and the numbers of their records."""
-    on = field.prepare(choose_backend(precision))._device
-    assert on is not None
+    """The cells of a field on a backend, and the numbers of their records."""
+    on = field.evaluator(choose_backend(precision)).data
     assert on.cells is not None
     cells = on.cells
     return cells, to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
@@ -302,9 +303,9 @@ def test_promises_hold(name: str) -> None:
     x = np.concatenate([places(curve, n // 2, 8), o[n // 2 :] + 0.3 * d[n // 2 :]])
     x = x.astype(np.float32).astype(np.float64)
     backend = choose_backend("double")
-    field = hk.SolidAngle(curve, cells=True).prepare(backend)
+    evaluator = hk.SolidAngle(curve, cells=True).evaluator(backend)
     p, v = to_vector3(backend, x), to_vector3(backend, d)
-    sample = field._sample(p, v)
+    sample = evaluator._sample(p, v)
     known = [(one.radius, one.constant) for one in (*sample.promises, *sample.ray_promises)]
     dr.eval(sample.value, sample.gradient, known)
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
@@ -336,8 +337,7 @@ def test_the_bound_of_bending_is_attained() -> None:
     but for the part of a thousandth that is added for rounding: a 500th less would be too little,
     in cells of far edges as in cells of near ones."""
     backend = choose_backend("double")
-    on = hk.SolidAngle(wavy(100), cells=True).prepare(backend)._device
-    assert on is not None
+    on = hk.SolidAngle(wavy(100), cells=True).evaluator(backend).data
     assert on.cells is not None
     table = to_numpy(on.cells.records.buffer).reshape(on.cells.count, -1)
     x = to_vector3(backend, table[:, :3])
@@ -434,7 +434,7 @@ def test_levels_and_tolerances_that_cells_do_not_reach() -> None:
 def test_values_and_derivatives_are_those_of_all_edges() -> None:
     curve, x = CURVES["trefoil"], places(CURVES["trefoil"], 300, 5)
     plain, field = hk.SolidAngle(curve), hk.SolidAngle(curve, cells=True)
-    field.prepare(choose_backend("single"))
+    field.evaluator(choose_backend("single"))
     for derivative in ("value", "gradient", "hessian"):
         by_cells, by_edges = (
             getattr(each, derivative)(x, precision="single") for each in (field, plain)
@@ -474,9 +474,8 @@ def test_memory_is_bounded_and_stated() -> None:
     sizes: list[int] = []
     for megabytes in (True, 3.0, 1.0, 0.01):
         field = hk.SolidAngle(curve, cells=megabytes)
-        prepared = field.prepare(choose_backend("double"))
-        assert prepared._device is not None
-        cells, said = prepared._device.cells, prepared.describe()["cells"]
+        evaluator = field.evaluator(choose_backend("double"))
+        cells, said = evaluator.data.cells, evaluator.describe()["cells"]
         if cells is None:
             sizes.append(0)
             assert said == "none, as they need more memory"
@@ -495,10 +494,10 @@ def test_many_rays_get_cells_by_themselves() -> None:
     assert hk.SolidAngle(wavy(100)).describe()["cells"] == "from 2,500,000 rays on"
     curve = wavy(1000)
     field = hk.SolidAngle(curve)
-    assert field.for_ray_count(999_999) is field
-    with_cells = field.for_ray_count(1_000_000)
-    assert with_cells.cells is True
-    assert field.for_ray_count(10**8) is with_cells
+    assert field.cell_choice(999_999) == NO_CELLS
+    with_cells = field.cell_choice(1_000_000)
+    assert with_cells.max_bytes == 256e6
+    assert field.cell_choice(10**8) == with_cells
     assert field.cells is None
     vector = choose_backend("single").Array3f
     for one in (
@@ -508,9 +507,17 @@ def test_many_rays_get_cells_by_themselves() -> None:
         hk.SolidAngle(vector(*curve.T)),
         hk.SolidAngle(hk.geometry.Circle(1.0, (0, 0, 0), (0, 0, 1))),
     ):
-        assert one.for_ray_count(10**9) is one
+        evaluator = one.evaluator(choose_backend("single"), Plan(ray_count=10**9))
+        assert evaluator.data.cells is None
+        assert evaluator.variable_accuracy is None
+    backend = choose_backend("double")
+    assert field.evaluator(backend, Plan(ray_count=999_999)).data.cells is None
+    many = field.evaluator(backend, Plan(ray_count=1_000_000))
+    assert many.data.cells is not None
+    assert many.variable_accuracy is not None
+    assert field.evaluator(backend, Plan(ray_count=10**8)).data is many.data
     x = places(curve, 500, 6)
-    found, _, error, *_ = sampled(with_cells, x, "double")
+    found, _, error, *_ = sampled(field, x, "double", Plan(ray_count=1_000_000))
     assert (np.abs(wrapped(found - angle_of(curve)(x))) <= error + 1e-9).all()
 
 
@@ -524,7 +531,7 @@ def test_loops_of_a_field_cannot_be_replaced() -> None:
         field.loops[0][:] *= 2
     given *= 2  # the caller's own
     assert field.loops[0].max() < 1.01
-    assert field.for_ray_count(10**8).loops is field.loops
+    assert field.evaluator(choose_backend("single"), Plan(ray_count=10**8)).field is field
 
 
 @pytest.mark.parametrize("cells", [-1.0, math.inf, math.nan, "yes", [1]])

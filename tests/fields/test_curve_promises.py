@@ -98,7 +98,7 @@ def remainders(field: hk.SolidAngle, x: np.ndarray, d: np.ndarray) -> list[np.nd
     """For each promise, |f(x + t d) - f(x) - t f'(x)|/(constant t^2/2) at 24 t up to its radius."""
     backend = choose_backend("double")
     p = to_vector3(backend, x)
-    sample = field.prepare(backend).evaluate(p)
+    sample = field.evaluator(backend).evaluate(p)
     value, slope = to_numpy(sample.value), (to_numpy(sample.gradient) * d).sum(axis=1)
     out: list[np.ndarray] = []
     for one in sample.promises:
@@ -141,7 +141,7 @@ def test_the_remainder_is_attained_on_the_axis_of_a_circle() -> None:
     """Of second order, at 45 degrees to the circle: a constant of 0.999 times would be wrong."""
     x, d = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
     backend = choose_backend("double")
-    sample = FIELDS["circle"].prepare(backend).evaluate(to_vector3(backend, x))
+    sample = FIELDS["circle"].evaluator(backend).evaluate(to_vector3(backend, x))
     narrowest = sample.promises[0]
     assert isinstance(narrowest, TaylorRemainder)
     field = FIELDS["circle"]

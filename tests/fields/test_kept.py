@@ -6,14 +6,14 @@ import dataclasses
 import gc
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend import choose_backend, to_vector3
+from harnack.backend import Backend, choose_backend, to_vector3
 from harnack.geometry.example_meshes import icosphere
 from harnack.rendering import Camera, register
 
@@ -28,15 +28,18 @@ FIELDS: dict[str, Callable[[], hk.Field]] = {
 }
 
 
+def uploaded(field: hk.Field, backend: Backend) -> Any:
+    """The data of a field on a backend."""
+    return cast("Any", field.evaluator(backend)).data
+
+
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_field_is_uploaded_once_to_each_backend(name: str) -> None:
     field = FIELDS[name]()
     for backend in (choose_backend(), choose_backend("double")):
-        prepared = field.prepare(backend)
-        assert prepared is not field
-        assert prepared.prepare(backend) is prepared
-        assert field.prepare(backend) is prepared
-    assert field.prepare(choose_backend()) is not prepared
+        data = uploaded(field, backend)
+        assert uploaded(field, backend) is data
+    assert uploaded(field, choose_backend()) is not data
 
 
 @pytest.mark.parametrize(
@@ -45,10 +48,9 @@ def test_a_field_is_uploaded_once_to_each_backend(name: str) -> None:
 )
 def test_what_is_kept_goes_with_the_field(name: str) -> None:
     field = FIELDS[name]()
-    prepared = field.prepare(choose_backend())
     hk.render(field, show="status", size=(8, 6), progress=False)
-    gone = weakref.ref(field), weakref.ref(prepared)
-    del field, prepared
+    gone = weakref.ref(field), weakref.ref(uploaded(field, choose_backend()))
+    del field
     gc.collect()
     assert [one() for one in gone] == [None, None]
 
@@ -82,8 +84,11 @@ class Ball(hk.Field):
             dr.norm(p) - self.radius, p / dr.norm(p), (hk.proofs.Lipschitz(1.0),)
         )
 
-    def prepare(self, backend: Any) -> Ball:
-        return Ball(dr.opaque(backend.Float, float(self.radius)))
+    def evaluator(self, backend: Any, plan: hk.fields.Plan = hk.fields.Plan()) -> Any:
+        del plan
+        return hk.fields.SampleEvaluator(
+            Ball(dr.opaque(backend.Float, float(self.radius))), backend
+        )
 
 
 def test_fields_of_anyone_are_drawn_as_they_are_now() -> None:
@@ -99,7 +104,7 @@ def test_vertices_with_derivatives_are_uploaded_each_time() -> None:
     backend = choose_backend()
     corners = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0.3], [0, -1, 0]])
     field = hk.SolidAngle(to_vector3(backend, corners))
-    assert field.prepare(backend) is not field.prepare(backend)
+    assert uploaded(field, backend) is not uploaded(field, backend)
 
 
 @pytest.mark.slow

@@ -17,7 +17,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles import dipole
+from harnack.fields.evaluator import Plan
+from harnack.fields.solid_angles import dipole, solid_angle
+from harnack.fields.solid_angles.cell_options import NO_CELLS
 from harnack.fmm import dipole_cells
 from harnack.fmm.dipole_expansion import COEFFICIENTS, DEGREE
 from harnack.fmm.local_expansion import (
@@ -122,7 +124,7 @@ def test_rounding_of_expansions_is_below_what_is_counted() -> None:
 
 def sampled(field: hk.DipolePotential, x: np.ndarray, precision: Precision) -> Any:
     backend = choose_backend(precision)
-    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, x))
     dr.eval(sample.value, sample.gradient, sample.value_error, sample.gradient_error)
     numbers = sample.value, sample.gradient, sample.value_error, sample.gradient_error
     return tuple(to_numpy(one).astype(np.float64) for one in numbers)
@@ -164,9 +166,8 @@ def test_errors_are_attained(part: float, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     point, normal = np.full((1, 3), 0.3), unit(np.ones((1, 3)))
     field = hk.DipolePotential(point, normal, [1.0], cells=True)
-    prepared = field.prepare(choose_backend("double"))
-    assert prepared._device is not None
-    on = prepared._device
+    on = field.evaluator(choose_backend("double")).data
+    assert isinstance(on.tree, dipole.DipoleTree)
     cells = on.tree.cells
     assert cells is not None
     table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
@@ -187,8 +188,7 @@ def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 0)
     point = np.full((1, 3), 0.3)
     field = hk.DipolePotential(point, unit(np.ones((1, 3))), [1.0], cells=True)
-    on = field.prepare(choose_backend("double"))._device
-    assert on is not None
+    on = field.evaluator(choose_backend("double")).data
     assert isinstance(on.tree, dipole.DipoleTree)
     cells = on.tree.cells
     assert cells is not None
@@ -242,8 +242,8 @@ def test_rays_along_faces_and_through_corners_of_cells(shift: float) -> None:
     points, normals, areas = cloud(400)
     points = (points + shift).astype(np.float32).astype(np.float64)
     field = hk.DipolePotential(points, normals, areas, cells=True)
-    on = field.prepare(choose_backend("single"))._device
-    assert on is not None
+    on = field.evaluator(choose_backend("single")).data
+    assert isinstance(on.tree, dipole.DipoleTree)
     cells = on.tree.cells
     assert cells is not None
     table = to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
@@ -265,9 +265,9 @@ def test_memory_is_bounded_and_stated() -> None:
     sizes: list[int] = []
     for megabytes in (True, 2.0, 1.2, 0.01):
         field = hk.DipolePotential(*some, cells=megabytes)
-        prepared = field.prepare(choose_backend("single"))
-        assert prepared._device is not None
-        cells, said = prepared._device.tree.cells, prepared.describe()["cells"]
+        evaluator = field.evaluator(choose_backend("single"))
+        assert isinstance(evaluator.data.tree, dipole.DipoleTree)
+        cells, said = evaluator.data.tree.cells, evaluator.describe()["cells"]
         if cells is None:
             sizes.append(0)
             assert said == "none, as they need more memory"
@@ -285,24 +285,28 @@ def test_memory_is_bounded_and_stated() -> None:
         assert hk.DipolePotential(*some, cells=asked).describe()["cells"] == "of at most 256 MB"
 
 
-def test_solids_tell_their_parts_how_many_rays_there_will_be() -> None:
+def test_solids_tell_their_parts_how_many_rays_there_will_be(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Parts of solids had no cells, however many rays there were."""
     points, normals, areas = cloud(300)
     curve = hk.SolidAngle(example_curves.torus_knot(2, 3, 60))
     knot = hk.solid(curve, around=(2 * math.pi, 0.4))
     inside = hk.solid(hk.DipolePotential(points, normals, areas), above=2 * math.pi)
     solid = (inside.scaled(2.0) - knot.translated((1.0, 0, 0))).offset(0.01)
-    assert solid.for_ray_count(1000) is solid
-    assert knot.variable_accuracy is None
-    many = solid.for_ray_count(10**8)
-    assert many.for_ray_count(10) is many
-    assert solid.for_ray_count(10**8) is many
-    assert knot.for_ray_count(10**8).variable_accuracy is not None
+    backend = choose_backend("single")
+    assert knot.evaluator(backend, Plan(ray_count=1000)).variable_accuracy is None
+    assert knot.evaluator(backend, Plan(ray_count=10**8)).variable_accuracy is not None
     o = np.random.default_rng(3).normal(size=(2000, 3)) * 0.2 + [0.0, 0.0, 6.0]
     d = np.random.default_rng(4).uniform(-2, 2, (2000, 3)) - o
-    hits, same = (
-        hk.trace(field, o, d, tolerance=1e-4, precision="single") for field in (solid, many)
-    )
+    hits = hk.trace(solid, o, d, tolerance=1e-4, precision="single")
+    calls = builds(monkeypatch)
+    monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
+    monkeypatch.setattr(dipole, "_PAYS", 1)
+    monkeypatch.setattr(solid_angle, "_MIN_RAYS", 1000)
+    monkeypatch.setattr(solid_angle, "_MIN_WORK", 1000)
+    same = hk.trace(solid, o, d, tolerance=1e-4, precision="single")
+    assert len(calls) == 1
     assert (np.asarray(hits.is_hit) == np.asarray(same.is_hit)).mean() > 0.998
     both = np.asarray(hits.is_hit & same.is_hit)
     apart = np.abs(np.asarray(hits.t)[both] - np.asarray(same.t)[both])
@@ -331,16 +335,22 @@ def builds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_many_rays_get_cells_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     some = cloud(300)
     field = hk.DipolePotential(*some)
-    assert field.for_ray_count(99_999) is field
-    with_cells = field.for_ray_count(100_000)
-    assert with_cells.cells is True
-    assert field.for_ray_count(200_000) is with_cells
+    assert field.cell_choice(99_999) == NO_CELLS
+    with_cells = field.cell_choice(100_000)
+    assert with_cells.max_bytes == 256e6
+    assert field.cell_choice(200_000) == with_cells
     assert field.cells is None
+    backend = choose_backend("single")
+    for count, choice in ((99_999, NO_CELLS), (100_000, with_cells)):
+        on = field.evaluator(backend, Plan(ray_count=count)).data
+        assert isinstance(on.tree, dipole.DipoleTree)
+        assert (on.tree.cells is None) == (choice == NO_CELLS)
+        assert field.evaluator(backend, Plan(ray_count=count)).data is on
     for given in (False, 3.0):
         refused = hk.DipolePotential(*some, cells=given)
-        assert refused.for_ray_count(10**8) is refused
+        assert refused.cell_choice(10**8) == refused.cell_choice()
     smooth = hk.DipolePotential(*some, smoothing=0.05)
-    assert smooth.for_ray_count(10**8) is smooth
+    assert smooth.cell_choice(10**8) == NO_CELLS
     # Tracing asks for them.
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     monkeypatch.setattr(dipole, "_PAYS", 1)
@@ -363,8 +373,8 @@ def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.Mo
     for at_once in (1 << 14, 37):
         monkeypatch.setattr(dipole_cells, "_CHUNK_SIZE", at_once)
         field = hk.DipolePotential(*cloud(300), cells=True)
-        on = field.prepare(choose_backend("double"))._device
-        assert on is not None
+        on = field.evaluator(choose_backend("double")).data
+        assert isinstance(on.tree, dipole.DipoleTree)
         assert on.tree.cells is not None
         cells = on.tree.cells
         assert cells.count > 100
@@ -375,14 +385,15 @@ def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.Mo
 def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     field = hk.DipolePotential(*cloud(600))
-    some, many = field.for_ray_count(5000), field.for_ray_count(60 * 600)
-    assert some is not many
-    assert field.for_ray_count(10**9) is many
-    assert field.for_ray_count(6000) is some
+    some, many = field.cell_choice(5000), field.cell_choice(60 * 600)
+    assert some != many
+    assert field.cell_choice(10**9) == many
+    assert field.cell_choice(6000) == some
     counts: list[int] = []
-    for one in (some, many, hk.DipolePotential(*cloud(600), cells=True)):
-        on = one.prepare(choose_backend("single"))._device
-        assert on is not None
+    requested = hk.DipolePotential(*cloud(600), cells=True)
+    for each, count in ((field, 5000), (field, 60 * 600), (requested, 0)):
+        on = each.evaluator(choose_backend("single"), Plan(ray_count=count)).data
+        assert isinstance(on.tree, dipole.DipoleTree)
         assert on.tree.cells is not None
         counts.append(on.tree.cells.count)
     assert 1.5 * counts[0] < counts[1] == counts[2]
@@ -437,14 +448,19 @@ def test_values_by_cells_are_within_their_bounds(precision: Precision) -> None:
     backend = choose_backend(precision)
     np.testing.assert_array_equal(field.value(x[:9], precision=precision), value[:9])
     np.testing.assert_array_equal(to_numpy(field.value(to_vector3(backend, x))), value)
-    np.testing.assert_array_equal(field.prepare(backend).value(x, precision=precision), value)
+    field.evaluator(backend)  # what is uploaded for rays changes no values
+    np.testing.assert_array_equal(field.value(x, precision=precision), value)
 
 
 def test_values_have_cells_where_those_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """And the same as rays; not where rays asked for them."""
     calls = builds(monkeypatch)
     some, x = cloud(300), np.eye(3)
-    hk.DipolePotential(*some).for_ray_count(10**9).value(x)
+    many = hk.DipolePotential(*some)
+    many.evaluator(choose_backend("double"), Plan(ray_count=10**9))
+    assert len(calls) == 1
+    calls.clear()
+    many.value(x)
     hk.DipolePotential(*some, cells=False).value(x)
     assert not calls
     field = hk.DipolePotential(*some, cells=True)
@@ -524,9 +540,11 @@ def test_solids_of_a_sum_sample_it_as_coarsely_as_the_sum_itself() -> None:
     cloud = hk.DipolePotential(points, points, cells=False)
     solid = hk.solid(cloud, above=2 * math.pi)
     backend = choose_backend("single")
-    coarsest = cloud.prepare(backend).variable_accuracy.coarsest
+    accuracy = cloud.evaluator(backend).variable_accuracy
+    assert accuracy is not None
+    coarsest = accuracy.coarsest
     assert coarsest < 1
     for made_of_it in (solid, solid | solid.translated((5, 0, 0))):
-        sampling = made_of_it.prepare(backend).variable_accuracy
+        sampling = made_of_it.evaluator(backend).variable_accuracy
         assert sampling is not None
         assert sampling.coarsest == coarsest

@@ -326,7 +326,7 @@ def test_trace_of_the_hessian_is_the_screened_equation() -> None:
                 (field.points, field.normals, field.areas), field.length, method=method
             )  # type: ignore[arg-type]
             x = np.random.default_rng(6).uniform(-0.5, 0.5, (50, 3))
-            rows = field.prepare(DOUBLE).hessian(to_vector3(DOUBLE, x))
+            rows = field.evaluator(DOUBLE).hessian(to_vector3(DOUBLE, x))
             hessian = np.stack([to_numpy(row) for row in rows], axis=1)
             value = field.value(x, precision="double")
             scale = np.abs(hessian).max()
@@ -343,7 +343,7 @@ def test_hessian_through_the_tree() -> None:
             field_of(cloud, length, method="tree", accuracy=15.0),
         ]
         whole, parts = (
-            np.stack([to_numpy(row) for row in one.prepare(DOUBLE).hessian(x)]) for one in fields
+            np.stack([to_numpy(row) for row in one.evaluator(DOUBLE).hessian(x)]) for one in fields
         )
         np.testing.assert_allclose(parts, whole, atol=1e-4 * np.abs(whole).max())
         assert np.abs(parts - whole).max() > 1e-12
@@ -365,7 +365,7 @@ def test_tree_keeps_its_promises_for_the_exact_function(length: float) -> None:
         x = x.astype(np.float32).astype(np.float64)
         f, g = exact(field, x)
         look = sample_field(field, x, precision)  # type: ignore[arg-type]
-        sample = field.prepare(choose_backend(precision)).evaluate(  # type: ignore[arg-type]
+        sample = field.evaluator(choose_backend(precision)).evaluate(  # type: ignore[arg-type]
             to_vector3(choose_backend(precision), x)  # type: ignore[arg-type]
         )
         doubt = np.broadcast_to(to_numpy(sample.gradient_error), len(x))

@@ -74,7 +74,7 @@ def test_error_of_a_curve_covers_single_precision() -> None:
     values = []
     for precision in ("single", "double"):
         backend = choose_backend(precision)
-        sample = field.prepare(backend).evaluate(backend.Array3f(points.T.astype(backend.dtype)))
+        sample = field.evaluator(backend).evaluate(backend.Array3f(points.T.astype(backend.dtype)))
         values.append((sample.value.numpy().astype(float), sample.value_error.numpy()))
     (rounded, error), (exact, _) = values
     assert (np.abs(rounded - exact) <= error).all()
