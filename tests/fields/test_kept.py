@@ -14,6 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import Backend, choose_backend, to_vector3
+from harnack.fields.evaluator import POINTS
 from harnack.geometry.example_meshes import icosphere
 from harnack.rendering import Camera, register
 
@@ -84,11 +85,10 @@ class Ball(hk.Field):
             dr.norm(p) - self.radius, p / dr.norm(p), (hk.proofs.Lipschitz(1.0),)
         )
 
-    def evaluator(self, backend: Any, plan: hk.fields.Plan = hk.fields.Plan()) -> Any:
+    def evaluator(self, backend: Backend, plan: hk.fields.Plan = POINTS) -> hk.fields.Evaluator:
         del plan
-        return hk.fields.SampleEvaluator(
-            Ball(dr.opaque(backend.Float, float(self.radius))), backend
-        )
+        radius: Any = dr.opaque(backend.Float, float(self.radius))
+        return hk.fields.SampleEvaluator(Ball(radius), backend)
 
 
 def test_fields_of_anyone_are_drawn_as_they_are_now() -> None:
