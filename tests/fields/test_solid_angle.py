@@ -489,12 +489,8 @@ def test_what_is_promised_along_a_line_holds(name: str, precision: str) -> None:
         x, d = x[away > 1e-4], unit(d[away > 1e-4])
     path = Ray(to_vector3(backend, x), to_vector3(backend, d), choose_enclosures(None))
     start = backend.Float(0)
-    promises = (
-        hk.SolidAngle(loops)
-        .evaluator(backend)
-        .sample_ray(path, start, start, start)
-        .sample.ray_promises
-    )
+    evaluator = hk.SolidAngle(loops).evaluator(backend)
+    promises = evaluator.sample_ray(path, start, start, start).sample.ray_promises
     gain = 0.0
     assert len(promises) == 6
     for promise in promises:
