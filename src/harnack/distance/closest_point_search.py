@@ -47,6 +47,7 @@ from harnack.fields.batch_evaluation import morton_order
 from harnack.fields.capabilities import NO_FACET, exactly_sampled
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.evaluator import Evaluator
+from harnack.fields.field import Field
 from harnack.geometry.neighborhoods import kd_tree
 
 if TYPE_CHECKING:

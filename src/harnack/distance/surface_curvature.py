@@ -59,8 +59,8 @@ class CurvatureSamples:
     normal: (n, 3) grad f/|grad f|.
     mean_error, gaussian_error: (n,) proved bounds of how far `mean` and `gaussian` may be off;
         infinite where they are NaN, and where the field does not state the errors of its
-        derivatives (`Evaluator.derivative_errors`). The rounding of the coordinates in which a moved or
-        bent field without a formula is evaluated is not included.
+        derivatives (`Evaluator.derivative_errors`). The rounding of the coordinates in which a
+        moved or bent field without a formula is evaluated is not included.
     """
 
     mean: FloatArray

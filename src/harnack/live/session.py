@@ -381,7 +381,7 @@ class Session:
                 replace(body, surface=body.surface.for_rays(rays)) for body in state.drawn
             ]
             state.prepared = [
-                PreviewSurface(self.live.place(body), surface_colors(body)) for body in drawn
+                PreviewSurface(self.live.place(body), surface_colors(body)) for body in state.drawn
             ]
         return state.prepared
 

@@ -259,7 +259,7 @@ def _overrides_sample_ray(field: Field) -> bool:
     """Whether the field computes the enclosures of its change along a ray by a method of its own,
     and not from its promises (proved bounds near a point) as other fields do. Fields with jumps do
     not count."""
-    kind: Any = type(field.evaluator(choose_backend("double")))
+    kind = type(field.evaluator(choose_backend("double")))
     return kind.sample_ray not in (Evaluator.sample_ray, Field.sample_ray) and not field.has_jumps
 
 
@@ -344,9 +344,9 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
 
 
 def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
-    """Check the method `differentiable_value` of the field's evaluator at points (n, 3): it has to return the value,
-    and its derivative by the automatic differentiation of Dr.Jit, in reverse mode, has to be the
-    gradient. Raises a BrokenPromiseError if not.
+    """Check the method `differentiable_value` of the field's evaluator at points (n, 3): it has to
+    return the value, and its derivative by the automatic differentiation of Dr.Jit, in reverse
+    mode, has to be the gradient. Raises a BrokenPromiseError if not.
 
     samples: the samples of the field at the points.
     """

@@ -585,8 +585,8 @@ class _Bisection:
 
 
 def refine_crossing(
-    evaluator: Evaluator, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, contact: Contact,
-    active: Mask,
+    evaluator: Evaluator, levels: Levels, tolerance: PreparedHitTolerance, path: Ray,
+    contact: Contact, active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """Find where rays cross the level more exactly, by bisection where needed.
 
