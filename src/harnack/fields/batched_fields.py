@@ -11,17 +11,21 @@ import abc
 import functools
 from collections import defaultdict
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar, cast
 from weakref import finalize
 
 import drjit as dr
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.arrays import as_kernel_parameters
+from harnack.backend.elementary import fmax
 from harnack.backend.tensors import accepts_tensors
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.fields.batch_evaluation import evaluate_points
-from harnack.fields.field import EvaluateOnly, Field
+from harnack.fields.capabilities import VariableAccuracy
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.field import Field, SampleEvaluator
 from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
@@ -35,6 +39,14 @@ class BatchedField(Field):
     for which results are NumPy arrays. Many such fields are sums over sources in a tree, in which a
     far cluster of sources is approximated as one source; this causes a truncation error. Subclasses
     define `values_at`."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Let `evaluator` of a new subclass that defines `evaluate` and not `evaluator` return an
+        object with the derivatives of `values_at`."""
+        defines_evaluator = "evaluator" in vars(cls)
+        super().__init_subclass__(**kwargs)
+        if "evaluate" in vars(cls) and not defines_evaluator:
+            cls.evaluator = BatchedField.evaluator
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -55,23 +67,18 @@ class BatchedField(Field):
         It is not called while a loop is being recorded."""
         return self.values_at(x, 1)
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate once with respect to p, in reverse
-        and in forward mode. Its derivative is the gradient of `sharp_values_at`."""
-        with dr.suspend_grad():
-            at = self.sharp_values_at(dr.detach(p))
-        # Dr.Jit would drop a gradient that is the literal 0, such as that of a closed mesh, and
-        # with it the dependence on p. A kernel parameter is no literal.
-        return dr.replace_grad(
-            at.value, dr.dot(as_kernel_parameters(at.gradient), p - dr.detach(p))
-        )
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The default is for fields that define `evaluate`, which it calls. Second derivatives are
+        those of `values_at`."""
+        del plan
+        return _EvaluatorOfUsersClass(self, backend)
 
     @accepts_dask_arrays("points")
     @accepts_tensors
     def value(self, points: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(points)):
             if dr.grad_enabled(points):
-                return self.differentiable_value(points)
+                return _differentiable_value(self, points)
             return self.values_at(points, 0).value
         return self._choose_at_points(points, precision, 0, lambda at: (at.value,))[0]
 
@@ -118,9 +125,6 @@ class BatchedField(Field):
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return _required_hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
-
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        return sample.gradient_error, self.values_at(p, 2).hessian_error
 
     @accepts_dask_arrays("points")
     def error_bound(self, points: Any, *, precision: Precision | None = None) -> FloatArray:
@@ -185,26 +189,127 @@ class BatchedField(Field):
         return evaluate_points(points, kernel, precision)
 
 
-class SumAtDetail(EvaluateOnly):
-    """A sum over sources, sampled at one accuracy scale (larger is more accurate; the parameter of
-    `VariableAccuracy.at`), with second derivatives. It is made of two functions of a point
-    p, a Dr.Jit 3-vector.
+class BatchedEvaluator(Evaluator):
+    """The evaluator of a `BatchedField`. Its second derivatives, and the gradient of the value that
+    can be differentiated, are those of the field at points.
 
-    evaluate: returns the sample at p: value, gradient and proved bounds of f near p.
-    values: returns the `PointValues` at p with the Hessian, at the same accuracy scale.
+    field: the field.
     """
 
-    def __init__(
-        self, evaluate: Callable[[Vec3], Sample], values: Callable[[Vec3], PointValues]
-    ) -> None:
-        super().__init__(evaluate)
-        self._values = values
+    field: BatchedField
+
+    def values_at(self, p: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
+        """Values of f at points p (`BatchedField.values_at`)."""
+        return self.field.values_at(p, derivatives, closer)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return _required_hessian(self.values_at(p, 2)).rows(backend_of(p).Array3f)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return sample.gradient_error, self.values_at(p, 2).hessian_error
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f at p as an expression that Dr.Jit can differentiate once with respect to p, in reverse
+        and in forward mode. Its derivative is the gradient of `BatchedField.sharp_values_at`."""
+        return _differentiable_value(self.field, p)
+
+
+class _EvaluatorOfUsersClass(BatchedEvaluator, SampleEvaluator):
+    """The evaluator of a `BatchedField` whose class defines `evaluate`."""
+
+    field: Any
+
+
+class SumData(Protocol):
+    """A sum over sources on a backend, which is sampled at any accuracy. The accuracy scale says
+    how accurately: larger is more accurate (`VariableAccuracy`)."""
+
+    @property
+    def backend(self) -> Backend: ...
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The accuracy scale of the coarsest samples."""
+        ...
+
+    def sample(self, p: Vec3, detail: Real) -> Sample:
+        """The sample of the sum at p.
+
+        detail: the accuracy scale: 0 gives the coarsest samples, 1 those of `Field.evaluate`, a
+            larger number more accurate ones.
+        """
+        ...
+
+
+class SourceSum(BatchedField):
+    """A field that is a sum over sources, such as dipoles. The sum is on a backend, and is sampled
+    at any accuracy (`SumData`). There may be two sums, one for tracing rays, and one for values at
+    large numbers of points (`values_at`). Subclasses define `_ray_data`."""
+
+    has_variable_accuracy = True
+
+    @abc.abstractmethod
+    def _ray_data(self, backend: Backend, plan: Plan) -> SumData:
+        """The sum for tracing rays on a backend, which is uploaded once (`cached_upload`)."""
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> SumEvaluator:
+        return SumEvaluator(self, self._ray_data(backend, plan))
+
+
+class SumEvaluator(BatchedEvaluator):
+    """The evaluator of a `SourceSum`.
+
+    field: the field.
+    data: the sum for tracing rays.
+    """
+
+    def __init__(self, field: SourceSum, data: SumData) -> None:
+        self.field, self.data = field, data
+        if field.has_variable_accuracy:
+            at = functools.partial(_SumAtAccuracy, field, data)
+            self.variable_accuracy = VariableAccuracy(at, data.coarsest_accuracy)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self.data.sample(p, self.data.backend.Float(1))
+
+
+@dataclass(frozen=True, eq=False)
+class _SumAtAccuracy(Evaluator):
+    """A sum over sources, sampled at one accuracy scale, with second derivatives.
+
+    field: the field.
+    data: the sum for tracing rays.
+    detail: the accuracy scale; larger is more accurate.
+    """
+
+    field: BatchedField
+    data: SumData
+    detail: Real
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self.data.sample(p, self.detail)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return _required_hessian(self._values(p)).rows(backend_of(p).Array3f)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         return sample.gradient_error, self._values(p).hessian_error
+
+    def _values(self, p: Vec3) -> PointValues:
+        """Values of f at points p, with the Hessian."""
+        real = self.data.backend.Float
+        # The accuracy scale of `values_at` must be at least 1.
+        return self.field.values_at(p, 2, fmax(real(self.detail), real(1)))
+
+
+def _differentiable_value(field: BatchedField, p: Vec3) -> Real:
+    """The values of a field at points p, as an expression that Dr.Jit can differentiate once with
+    respect to p. Its derivative is the gradient of `sharp_values_at`."""
+    with dr.suspend_grad():
+        at = field.sharp_values_at(dr.detach(p))
+    # Dr.Jit would drop a gradient that is the literal 0, such as that of a closed mesh, and with it
+    # the dependence on p. A kernel parameter is no literal.
+    return dr.replace_grad(at.value, dr.dot(as_kernel_parameters(at.gradient), p - dr.detach(p)))
 
 
 def _required_hessian(values: PointValues) -> SymmetricMatrix:

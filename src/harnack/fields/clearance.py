@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import drjit as dr
 import numpy as np
@@ -19,8 +19,7 @@ from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
-from harnack.fields.batched_fields import BatchedField, SumAtDetail, cached_prepare
-from harnack.fields.capabilities import VariableAccuracy
+from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.field import Field
 from harnack.fmm.unit_frame import UnitFrame
 from harnack.tree.empty_space import (
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.enclosures.samples import Sample
+    from harnack.fields.evaluator import Evaluator
     from harnack.geometry import ConvexHull, Volume
     from harnack.tree.empty_space import Clearance
 
@@ -58,7 +58,7 @@ def clearance_function(
     precision: "single" or "double", in which f is evaluated.
     """
     backend = choose_backend(precision)
-    prepared = field.prepare(backend)
+    evaluator = field.evaluator(backend)
     # Kernel parameters, so that other levels compile nothing.
     values = tuple(dr.opaque(backend.Float, level) for level in levels)
     targets = Levels(values, field.period)
@@ -67,7 +67,7 @@ def clearance_function(
         """The clearances (n,) of points (n, 3)."""
         p = to_vector3(backend, points)
         return to_numpy(
-            level_distance_lower_bound(backend, prepared, targets, p, prepared.evaluate(p))
+            level_distance_lower_bound(backend, evaluator, targets, p, evaluator.evaluate(p))
         )
 
     return clearance
@@ -152,13 +152,13 @@ def occupied_cells(
 
 
 def level_distance_lower_bound(
-    backend: Backend, field: Field, levels: Levels, p: Vec3, sample: Sample
+    backend: Backend, evaluator: Evaluator, levels: Levels, p: Vec3, sample: Sample
 ) -> Real:
     """A proved lower bound of the distance from the points p to the nearest level set of f.
 
-    field: the field, prepared for the backend.
+    evaluator: the evaluator of f on the backend.
     levels: the levels, with the period of f.
-    sample: the sample of the field at p.
+    sample: the sample of f at p.
 
     Proof. Let v be a unit direction and s the slope of f at p along v. An enclosure (a bound of f
     along a line that follows from a promise) holds f(p + t v) within an interval [L(t, s), U(t,
@@ -195,8 +195,8 @@ def level_distance_lower_bound(
     downward = longest_free_length(enclosures, LevelGaps(gaps.below, inf))
     # If a gap is 0 or less, the point may lie on a level set.
     distance = dr.select(gaps.nearest > 0, fmin(upward, downward), 0)
-    if field.jumps is not None:
-        distance = fmin(distance, field.jumps.distance(p))
+    if evaluator.jumps is not None:
+        distance = fmin(distance, evaluator.jumps.distance(p))
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
 
 
@@ -249,51 +249,3 @@ class DeviceField(Field, Generic[Uploaded]):
         """The data for values at points, which are uploaded once for each backend and then
         cached."""
         return self._batches.get_or_make(backend, lambda: self._upload(backend, traced=False))
-
-
-class VariableAccuracyField(DeviceField[Uploaded], BatchedField):
-    """A field that is a sum over sources, whose data lie on a backend, and that can be sampled at
-    any accuracy. The accuracy scale says how accurately: larger is more accurate
-    (`VariableAccuracy`). Subclasses define `_sample`."""
-
-    has_separate_batch_data: ClassVar[bool] = True
-    """Whether the data for values at points differ from the data for tracing rays."""
-
-    @abc.abstractmethod
-    def _sample(self, on: Uploaded, p: Vec3, detail: Real) -> Sample:
-        """The sample of f at p with a given accuracy.
-
-        on: the field's data on a backend.
-        detail: the accuracy scale: 0 gives the coarsest samples, 1 those of `evaluate`, a larger
-            number more accurate ones.
-        """
-
-    def evaluate(self, p: Vec3) -> Sample:
-        on = self._data_for(p)
-        return self._sample(on, p, on.backend.Float(1))
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        return VariableAccuracy(self._at_accuracy, self._coarsest_accuracy())
-
-    def _coarsest_accuracy(self) -> float:
-        """The accuracy scale of the coarsest samples. The default is 1."""
-        return 1.0
-
-    def _at_accuracy(self, detail: Real) -> Field:
-        """The field, sampled with this accuracy scale."""
-        on = self._require_data()
-        # The accuracy scale of `values_at` must be at least 1.
-        closer = fmax(on.backend.Float(detail), on.backend.Float(1))
-        return SumAtDetail(
-            lambda p: self._sample(on, p, detail), lambda p: self.values_at(p, 2, closer)
-        )
-
-    def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points. If the field is prepared for this backend, and uses the
-        same data for both purposes (`has_separate_batch_data` is False), they are its data for
-        tracing. Otherwise they are uploaded once for each backend and then cached."""
-        device = self._device
-        if self.has_separate_batch_data or device is None or device.backend is not backend:
-            return super()._batch_data(backend)
-        return device

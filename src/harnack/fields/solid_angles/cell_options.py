@@ -6,8 +6,9 @@ and False builds none. A number builds them in any case and limits their memory 
 megabytes.
 
 The number of rays decides whether cells save time. `trace`, `render`, and views that Python draws
-tell it to a field (`Field.for_ray_count`); solids tell it to their operands, too. To build the
-cells of a cloud takes as long as to trace about six rays per point without cells.
+tell it to a field (`Plan.ray_count`); solids tell it to their operands, too. To build the cells of
+a cloud takes as long as to trace about six rays per point without cells. `CellChoice` is the choice
+for a number of rays.
 
 Values at points use cells if the user requested cells, whatever the number of points. If that
 number decided, the values of a part of the points could differ from those of all points by more
@@ -20,6 +21,7 @@ import abc
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import numpy as np
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend
 
-__all__ = ["BuiltCells", "FieldWithCells"]
+__all__ = ["NO_CELLS", "BuiltCells", "CellChoice", "FieldWithCells"]
 
 # Megabytes that cells may take if the option `cells` is True, and so names no limit.
 _MEGABYTES = 256.0
@@ -53,6 +55,39 @@ class BuiltCells(Protocol):
 
     @property
     def size(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class CellChoice:
+    """Which FMM cells a field has on a backend.
+
+    max_bytes: the number of bytes that they may take; 0 for no cells.
+    finer: whether cells are smaller, which takes longer to build them and saves time for very many
+        rays. Fields whose cells have only one size ignore it.
+    """
+
+    max_bytes: int = 0
+    finer: bool = True
+
+    def __bool__(self) -> bool:
+        """Whether there are cells, if they fit into the memory."""
+        return self.max_bytes > 0
+
+    def describe(self, built: BuiltCells | None) -> dict[str, str]:
+        """The entry "cells" of a description, with the number and the memory of cells that have
+        been built; an empty dictionary if this is the choice of no cells.
+
+        built: the cells; None if they would have taken too much memory.
+        """
+        if not self:
+            return {}
+        if built is None:
+            return {"cells": "none, as they need more memory"}
+        return {"cells": f"{built.count} of {built.size / 1e6:.1f} MB"}
+
+
+NO_CELLS = CellChoice()
+"""The choice of no cells."""
 
 
 class FieldWithCells(Field):
@@ -101,6 +136,7 @@ class FieldWithCells(Field):
         self.cells_for_values, self.finer_cells = bool(cells), True
         self._with_cells: TransientCache[bool, Self] = TransientCache()
         self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
+        self._built_by_choice: TransientCache[tuple[Backend, CellChoice], Any] = TransientCache()
 
     def with_cells(self, cells: bool = True) -> Self:
         """Copy this field, with cells that are used for rays but not for values at points; or
@@ -118,6 +154,27 @@ class FieldWithCells(Field):
         """
         key = backend, self.max_bytes(), self.finer_cells
         return self._built.get_or_make(key, build)
+
+    def cell_choice(self, ray_count: int = 0) -> CellChoice:
+        """The cells with which to trace `ray_count` rays. If the user left the choice open (`cells`
+        is None), there are cells if there are so many rays that cells save time. The choice for 0
+        rays is also that for values at points: cells that the user requested, or none.
+        """
+        if self.cells is not None:
+            return CellChoice(int(1e6 * (_MEGABYTES if self.cells is True else self.cells)))
+        if not self.cells_pay_from() <= ray_count:
+            return NO_CELLS
+        return CellChoice(int(1e6 * _MEGABYTES), self.finer_cells_pay_from() <= ray_count)
+
+    def built_cells(
+        self, backend: Backend, choice: CellChoice, build: Callable[[], Built]
+    ) -> Built:
+        """The cells of a choice on a backend, which are built once and used for values and for
+        tracing.
+
+        build: a function that builds the cells.
+        """
+        return self._built_by_choice.get_or_make((backend, choice), build)
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
@@ -145,6 +202,15 @@ class FieldWithCells(Field):
     def max_bytes(self) -> int:
         """Compute the number of bytes that the cells may take; 0 if there are none."""
         return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
+
+    def describe_cell_option(self) -> dict[str, str]:
+        """The entry "cells" of `describe`: how much memory cells may take; or, if the number of
+        rays decides, the smallest number for which there are cells. An empty dictionary if there
+        are no cells in any case."""
+        if self.cells is None and self.cells_pay_from() < math.inf:
+            return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
+        choice = self.cell_choice()
+        return {"cells": f"of at most {choice.max_bytes / 1e6:g} MB"} if choice else {}
 
     def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
         """Make the entry "cells" of `describe`, or an empty dictionary if the field has no cells.

@@ -27,11 +27,12 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_positive, as_real, no_derivatives
+from harnack.fields.batched_fields import SourceSum, SumEvaluator, cached_upload
 from harnack.fields.capabilities import Boundary
-from harnack.fields.clearance import VariableAccuracyField
+from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.field import Sample, space_scaled
 from harnack.fields.parameters import record_arguments
-from harnack.fields.solid_angles.cell_options import FieldWithCells
+from harnack.fields.solid_angles.cell_options import CellChoice, FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.smoothed import SmoothedSum
@@ -294,7 +295,7 @@ _MIN_LEVEL_FRACTION, _MIN_LEVEL = 0.1, 1e-3
 _FAR_OF_SIZE = 0.04
 
 
-class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_DipoleData"]):
+class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
     """The dipole potential f(x) = sum a_i n_i.(p_i - x)/|p_i - x|^3 of oriented points p_i with
     unit normals n_i (paper, Eq. 12). Each point stands for an area a_i of the surface. f is about 4
     pi inside and 0 outside, and the surface is the level set f = 2 pi. It passes through every
@@ -335,15 +336,15 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
     cells: whether to build FMM cells, for many rays through many points. In a cell, near points are
         summed directly and all others are one polynomial, so that an evaluation for tracing costs a
         tenth. None builds cells if they save more time than their construction takes
-        (`for_ray_count`): for pictures of small clouds and for path tracing. True always builds
+        (`cells_pay_from`): for pictures of small clouds and for path tracing. True always builds
         them, and uses them also for values and gradients at points, which saves time for more than
         some 600 values per point. False never builds them. A number builds them, too, and limits
         their memory to so many megabytes; the limit is 256 for True. Cells take some 1 kB per
         point. If this exceeds the limit, cells are larger and slower. If these would still be too
-        large, there are no cells, and `describe` of a prepared field reports this. Cells are built
-        at the first trace, for each precision. This takes as long as tracing 100,000 to a million
-        rays without cells, and several times the memory of the cells. All bounds are proved,
-        whatever the arguments.
+        large, there are no cells, and `describe` of an evaluator reports this. Cells are built at
+        the first trace, for each precision. This takes as long as tracing 100,000 to a million rays
+        without cells, and several times the memory of the cells. All bounds are proved, whatever
+        the arguments.
 
     `with_points` gives the field of points that have moved.
 
@@ -542,7 +543,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         closer: the accuracy scale; larger is more accurate. A number below 1 counts as 1.
         """
-        data = self._batch_data(backend_of(x))
+        data = self._upload(backend_of(x), traced=False, cells=self.cell_choice())
         x = data.to_unit(x)
         # The sum of the areas, in unit coordinates.
         weight = float(self.areas.sum()) / self._size**2
@@ -568,11 +569,19 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         hierarchy, it is that hierarchy, which stays valid for moved points."""
         return self._given_hierarchy or dipole_hierarchy((self.points - self._center) / self._size)
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _DipoleData:
+    def _ray_data(self, backend: Backend, plan: Plan) -> _DipoleData:
+        return self._upload(backend, traced=True, cells=self.cell_choice(plan.ray_count))
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> DipoleEvaluator:
+        return DipoleEvaluator(self, self._ray_data(backend, plan))
+
+    @cached_upload
+    def _upload(self, backend: Backend, *, traced: bool, cells: CellChoice) -> _DipoleData:
         """Build the sum over the dipoles on a backend: smoothed, or with cells if they are wanted.
 
         traced: whether the sum is for tracing, and not for values at points. By default a sum for
             tracing is more accurate.
+        cells: the FMM cells of the sum.
         """
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         unit_points = (self.points - self._center) / self._size
@@ -584,15 +593,15 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             tree = SmoothedSum.of(backend, self._hierarchy, rows, height, accuracy)
         else:
             build = None
-            if self.cells and (traced or self.cells_for_values):
-                build = self._cell_builder(backend, self._half_side(unit_points))
+            if cells:
+                build = self._cell_builder(backend, self._half_side(unit_points), cells)
             tree = DipoleTree.of(backend, self._hierarchy, unit_points, moments, accuracy, build)
-        return _DipoleData(*frame_parameters(backend, self._center, self._size), tree)
+        return _DipoleData(*frame_parameters(backend, self._center, self._size), tree, cells)
 
-    def _cell_builder(self, backend: Backend, half: float) -> BuildCells:
+    def _cell_builder(self, backend: Backend, half: float, choice: CellChoice) -> BuildCells:
         """Return a function that builds the FMM cells of the cube [-half, half]^3, in unit
-        coordinates, on a backend (`BuildCells`). Its first call builds the cells; later calls
-        return the same cells."""
+        coordinates, on a backend (`BuildCells`). Its first call builds the cells; later calls for
+        the same choice of cells return the same cells."""
 
         def build(
             levels: list[NodeMoments], rows: FloatArray, dipoles: RecordTable
@@ -604,11 +613,12 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
             rows: the records of the dipoles, in the slots of the tree's leaves.
             dipoles: the same records on the backend.
             """
-            return self.build_cached(
+            return self.built_cells(
                 backend,
+                choice,
                 lambda: build_cells(
-                    backend, self._hierarchy, levels, rows, dipoles, half, self.max_bytes(),
-                    finer=self.finer_cells,
+                    backend, self._hierarchy, levels, rows, dipoles, half, choice.max_bytes,
+                    finer=choice.finer,
                 ),
             )  # fmt: skip
 
@@ -634,18 +644,6 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         """The smallest number of rays for which smaller cells save more time than their longer
         construction costs."""
         return _FINER_PAYS_PER_POINT * len(self.points)
-
-    def _coarsest_accuracy(self) -> float:
-        return 1.0 if self._device is None else self._device.tree.coarsest_accuracy
-
-    def _sample(self, on: _DipoleData, p: Vec3, detail: Real) -> Sample:
-        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
-        f near p.
-
-        on: the field's data on a backend.
-        detail: the accuracy scale; larger is more accurate.
-        """
-        return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level whose surface would be unbounded."""
@@ -685,12 +683,25 @@ class DipolePotential(OrientedPoints, FieldWithCells, VariableAccuracyField["_Di
         were given or estimated; the report of the denoising; the cells; smoothing and level."""
         origins = ("estimated" if is_estimated else "given" for is_estimated in self.is_estimated)
         sources = dict(zip(("normals", "areas"), origins, strict=True))
-        tree = None if self._device is None else self._device.tree
-        cells = self.describe_cells(tree.cells if isinstance(tree, DipoleTree) else None)
+        cells = self.describe_cell_option()
         report = {"points": len(self.points), **sources, **self.fit_report, **cells}
         if self.smoothing:
             report |= {"smoothing": self.smoothing, "level": self.default_level}
         return report
+
+
+class DipoleEvaluator(SumEvaluator):
+    """The evaluator of a dipole potential."""
+
+    field: DipolePotential
+    data: _DipoleData
+
+    def describe(self) -> dict[str, Any]:
+        """The facts of `DipolePotential.describe`, with the number and the memory of the FMM cells
+        that were built."""
+        tree = self.data.tree
+        built = tree.cells if isinstance(tree, DipoleTree) else None
+        return self.field.describe() | self.data.cell_choice.describe(built)
 
 
 @dataclass(frozen=True)
@@ -699,9 +710,16 @@ class _DipoleData(UnitFrame):
     coordinates, in which the points are centered at 0 and have a size of about one.
 
     tree: the sum over the dipoles in unit coordinates, plain or smoothed.
+    cell_choice: the FMM cells that the sum was to have.
     """
 
     tree: DipoleTree | SmoothedSum
+    cell_choice: CellChoice
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The accuracy scale of the coarsest samples."""
+        return self.tree.coarsest_accuracy
 
     def sample(self, p: Vec3, detail: Real) -> Sample:
         """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of

@@ -13,7 +13,7 @@ import numpy as np
 from harnack.backend import FloatArray, IntArray
 from harnack.backend.validation import as_positive, as_real
 from harnack.fields.batched_fields import BatchedField
-from harnack.fields.field import Field, Sample
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.solid_angles.morph_slice import MorphSlice
 from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fmm.point_values import PointValues
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import Backend, Precision, Real, Vec3
-    from harnack.fields.capabilities import Jumps, VariableAccuracy
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -133,27 +132,21 @@ class Morph(BatchedField):
         points = self._slice.point_counts
         return {**heights, "points of a": points[0], "points of b": points[1]}
 
-    # All other methods delegate to the slice.
+    # At each height the function is that of the slice.
 
-    def prepare(self, backend: Backend) -> Field:
-        return self._slice.prepare(backend)
+    @property
+    def has_jumps(self) -> bool:
+        return self._slice.has_jumps
 
-    def evaluate(self, p: Vec3) -> Sample:
-        return self._slice.evaluate(p)
+    @property
+    def has_variable_accuracy(self) -> bool:
+        return self._slice.has_variable_accuracy
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        return self._slice.evaluator(backend, plan)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         return self._slice.values_at(x, derivatives, closer)
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        return self._slice.variable_accuracy
-
-    @property
-    def jumps(self) -> Jumps | None:
-        return self._slice.jumps
-
-    def for_ray_count(self, count: int) -> Field:
-        return self._slice.for_ray_count(count)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         self._slice.validate_levels(levels)

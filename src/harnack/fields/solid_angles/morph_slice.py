@@ -28,7 +28,8 @@ from harnack.backend.elementary import fmax
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch_evaluation import evaluate_points
-from harnack.fields.clearance import VariableAccuracyField, occupied_cells, tight_extent
+from harnack.fields.batched_fields import SourceSum, cached_upload
+from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.field import Sample
 from harnack.fmm.point_values import PointValues
 from harnack.fmm.radial_kernel import (
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
+    from harnack.fields.evaluator import Plan
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -384,7 +386,7 @@ _MOST_CELLS = 40_000
 _CELLS_ACROSS = 128
 
 
-class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
+class MorphSlice(SourceSum):
     """A shape between two closed meshes a and b, as the level set f = 1/2 of the field
     f(x) = (U_a(x, w) + U_b(x, gap - w))/(2 pi^2) with 0 < w < gap. For small w the shape is near
     mesh a, for w near gap it is near mesh b.
@@ -412,7 +414,6 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
     default_level = 0.5
     is_larger_inside = True
-    has_separate_batch_data = False
 
     def __init__(
         self, corners: Sequence[FloatArray], *, w: float, gap: float, spacing: float,
@@ -464,7 +465,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         closer: the accuracy scale; larger is more accurate.
         """
-        buffers = self._batch_data(backend_of(x))
+        buffers = self._upload(backend_of(x))
         x = buffers.to_unit(x)
         sums = buffers.sums(x, closer, derivatives).sums
         # rounding: of the last operations. weight: the sum of the lengths of all moments. f is 1.0
@@ -499,7 +500,7 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
         def kernel(backend: Backend, x: Vec3) -> tuple[Real]:
             """Compute the bound at points x (3, n), as a length in the unit of the meshes, in a
             tuple of one entry."""
-            data = self._batch_data(backend)
+            data = self._upload(backend)
             x = data.to_unit(x)
             # error: the bound of the quadrature's error of f, over both meshes. The ratios of a
             # mesh bound |T| and the integral of |d|^2 of each group, divided by |m|.
@@ -523,10 +524,14 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
 
         return evaluate_points(points, kernel, precision)[0]
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _SliceBuffers:
+    def _ray_data(self, backend: Backend, plan: Plan) -> _SliceBuffers:
+        del plan
+        return self._upload(backend)
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> _SliceBuffers:
         """Build the sums over the quadrature points of both meshes on a backend. They are the same
-        for tracing and for values at points, whatever `traced` is."""
-        del traced
+        for tracing and for values at points."""
         clouds = tuple(
             RadialTreecode(
                 backend, dipoles, SlicedKernel(backend, height / self._size), self.accuracy
@@ -534,15 +539,6 @@ class MorphSlice(VariableAccuracyField["_SliceBuffers"]):
             for dipoles, height in zip(self._dipoles, self.heights, strict=True)
         )
         return _SliceBuffers(*frame_parameters(backend, self._center, self._size), clouds)
-
-    def _sample(self, on: _SliceBuffers, p: Vec3, detail: Real) -> Sample:
-        """Compute a sample at points p (3, n): f, its gradient, error bounds, and proved bounds of
-        f near p.
-
-        on: the field's data on a backend.
-        detail: the accuracy scale; larger is more accurate.
-        """
-        return on.sample(p, detail)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level whose surface would be unbounded."""
@@ -583,6 +579,11 @@ class _SliceBuffers(UnitFrame):
     """
 
     clouds: tuple[RadialTreecode, ...]
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The accuracy scale of the coarsest samples."""
+        return 1.0
 
     def sums(self, x: Vec3, closer: Real, derivatives: int) -> RadialSums:
         """Sum over the quadrature points of both meshes, at points x (3, n) in unit coordinates.

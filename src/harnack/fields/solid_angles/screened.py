@@ -23,7 +23,8 @@ from harnack.backend.elementary import fmax, fmin
 from harnack.backend.validation import as_positive
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, TaylorRemainder
-from harnack.fields.clearance import VariableAccuracyField, tight_extent
+from harnack.fields.batched_fields import SourceSum, cached_upload
+from harnack.fields.clearance import tight_extent
 from harnack.fields.field import Sample
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fmm.point_values import PointValues
@@ -48,7 +49,7 @@ from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.capabilities import VariableAccuracy
+    from harnack.fields.evaluator import Plan
     from harnack.geometry import Volume
 
 MAX_LENGTHS = 80.0
@@ -248,7 +249,7 @@ _SMALLEST_LEVEL = 1e-20
 _ON_DIPOLE, _ANY_LEVEL = 32, 1e5
 
 
-class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuffers"]):
+class ScreenedWindingNumber(OrientedPoints, SourceSum):
     """The screened winding number w of oriented points y_i, as a field: w(x) = (1/4 pi) sum_i a_i
     n_i.(y_i - x) (1 + rho_i/l) exp(-rho_i/l)/rho_i^3, rho_i = |y_i - x|. Points y_i with unit
     normals n_i, also called dipoles, stand for areas a_i of a surface, and l is the screening
@@ -302,7 +303,6 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
     or accuracy.
     """
 
-    has_separate_batch_data = False
     is_larger_inside = True
 
     def __init__(
@@ -407,12 +407,12 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
         closer: the accuracy scale; larger is more accurate.
         """
-        data = self._batch_data(backend_of(x))
+        data = self._upload(backend_of(x))
         x = data.to_unit(x)
         sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
         # w is 1.0 times the sum. The last argument bounds the rounding of the last operations.
         values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
-        cutoff, slope, second = self._cutoff_errors(data, sums, coordinate_rounding(x))
+        cutoff, slope, second = data.cutoff_errors(sums, coordinate_rounding(x))
         values = dataclasses.replace(
             values,
             error=values.error + cutoff,
@@ -425,33 +425,19 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
         terms = 64 if self.method == "tree" else len(self.points)
         return values.with_far_field_errors(x, max(terms, 64), weight).rescaled(data.size)
 
-    def _cutoff_errors(
-        self, data: _ScreenedBuffers, sums: SourceSums, unit: Real
-    ) -> tuple[Real, Real, Real]:
-        """Return bounds of three errors, of the value, of the gradient and of second derivatives,
-        which screening causes in addition to the errors of plain dipoles. All is in unit
-        coordinates.
+    @property
+    def has_variable_accuracy(self) -> bool:
+        """Whether the field can be sampled with another accuracy; not if all points are summed."""
+        return self.method == "tree"
 
-        data: the kernel and the dipoles on a backend.
-        sums: the sums at the points.
-        unit: the rounding of a coordinate.
+    def _ray_data(self, backend: Backend, plan: Plan) -> _ScreenedBuffers:
+        del plan
+        return self._upload(backend)
 
-        Exponentials are replaced by exp(-80) = 2e-35 where they are smaller (`MAX_LENGTHS`). They
-        are multiplied by at most Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have
-        Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
-        second derivatives.
-        """
-        # The error of the value is proportional to 1/rho^2; its derivatives to 2/rho^3 and 6/rho^4.
-        inverse = dr.rcp(sums.singularity_distance)
-        value_error = 2e-30 * float(self._rows[:, 6].sum()) * inverse * inverse
-        fourth = 0.25 * data.kernel.kappa * sums.s4
-        hessian_error = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * value_error * inverse * inverse)
-        return value_error, 2 * value_error * inverse, hessian_error
-
-    def _upload(self, backend: Backend, *, traced: bool) -> _ScreenedBuffers:
+    @cached_upload
+    def _upload(self, backend: Backend) -> _ScreenedBuffers:
         """Copy the kernel and the dipoles to a backend. They are the same for tracing and for
         values at points."""
-        del traced
         kernel = YukawaKernel(backend, self._kappa)
         if self.method == "sum":
             dipoles = DirectSum(backend, self._rows, kernel)
@@ -460,44 +446,10 @@ class ScreenedWindingNumber(OrientedPoints, VariableAccuracyField["_ScreenedBuff
                 backend, ClusteredDipoles.of(self._rows), kernel, self.accuracy
             )
         return _ScreenedBuffers(
-            *frame_parameters(backend, self._center, self._size), kernel, dipoles
-        )
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the field is sampled with another accuracy; None if all points are summed."""
-        return super().variable_accuracy if self.method == "tree" else None
-
-    def _sample(self, on: _ScreenedBuffers, p: Vec3, detail: Real) -> Sample:
-        """A sample of w at points p in user coordinates: value, gradient, errors and proved bounds
-        of w near p. At a dipole itself the value is 0 and the gradient is so steep that p counts as
-        close to any level.
-
-        on: the kernel and the dipoles on a backend.
-        detail: the accuracy scale; larger is more accurate.
-        """
-        x = on.to_unit(p)
-        # 1: with gradients.
-        screened, epsilon = on.dipoles.sums(x, detail, 1), on.backend.machine_epsilon
-        sums, unit = screened.sums, coordinate_rounding(x)
-        cutoff, slope, _ = self._cutoff_errors(on, sums, unit)
-        error = sums.truncation + sums.rounding + cutoff
-        slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
-        # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
-        # every level is close, and an error as large as the distance to such a level.
-        is_off_dipole = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
-        steep_gradient = on.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
-        value = dr.select(is_off_dipole, sums.value, 0)
-        gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
-        promises, ball = screened_promises(screened, value, gradient, on.kernel, on.size, epsilon)
-        return Sample(
-            value,
-            gradient / on.size,
-            promises,
-            dr.select(is_off_dipole, error, _ANY_LEVEL),
-            dr.select(is_off_dipole, slope_error / on.size, 0),
-            truncation_error=dr.select(is_off_dipole, sums.truncation, 0),
-            alternative_promises=(ball,),
+            *frame_parameters(backend, self._center, self._size),
+            kernel,
+            dipoles,
+            float(self._rows[:, 6].sum()),
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -551,7 +503,67 @@ class _ScreenedBuffers(UnitFrame):
 
     kernel: the Yukawa kernel, with kappa in unit coordinates.
     dipoles: the sum over the dipoles.
+    weight: the sum of the lengths of all moments.
     """
 
     kernel: YukawaKernel
     dipoles: RadialSum
+    weight: float
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The accuracy scale of the coarsest samples."""
+        return 1.0
+
+    def cutoff_errors(self, sums: SourceSums, unit: Real) -> tuple[Real, Real, Real]:
+        """Return bounds of three errors, of the value, of the gradient and of second derivatives,
+        which screening causes in addition to the errors of plain dipoles. All is in unit
+        coordinates.
+
+        sums: the sums at the points.
+        unit: the rounding of a coordinate.
+
+        Exponentials are replaced by exp(-80) = 2e-35 where they are smaller (`MAX_LENGTHS`). They
+        are multiplied by at most Q_3(80) exp(80) = 9e4. Fourth derivatives of the kernel have
+        Q_4(t) <= (1 + t/4) Q_3(t), and a coordinate is off by `unit`: this adds to the error of
+        second derivatives.
+        """
+        # The error of the value is proportional to 1/rho^2; its derivatives to 2/rho^3 and 6/rho^4.
+        inverse = dr.rcp(sums.singularity_distance)
+        value_error = 2e-30 * self.weight * inverse * inverse
+        fourth = 0.25 * self.kernel.kappa * sums.s4
+        hessian_error = dr.fma(SECOND_ROUNDINGS * unit, fourth, 6 * value_error * inverse * inverse)
+        return value_error, 2 * value_error * inverse, hessian_error
+
+    def sample(self, p: Vec3, detail: Real) -> Sample:
+        """A sample of w at points p in user coordinates: value, gradient, errors and proved bounds
+        of w near p. At a dipole itself the value is 0 and the gradient is so steep that p counts as
+        close to any level.
+
+        detail: the accuracy scale; larger is more accurate.
+        """
+        x = self.to_unit(p)
+        # 1: with gradients.
+        screened, epsilon = self.dipoles.sums(x, detail, 1), self.backend.machine_epsilon
+        sums, unit = screened.sums, coordinate_rounding(x)
+        cutoff, slope, _ = self.cutoff_errors(sums, unit)
+        error = sums.truncation + sums.rounding + cutoff
+        slope_error = sums.gradient_truncation + dr.fma(SLOPE_ROUNDINGS * unit, sums.s4, slope)
+        # At a dipole, up to rounding, f has all values: the sample has a gradient so steep that
+        # every level is close, and an error as large as the distance to such a level.
+        is_off_dipole = (sums.singularity_distance > _ON_DIPOLE * epsilon) & dr.isfinite(sums.value)
+        steep_gradient = self.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
+        value = dr.select(is_off_dipole, sums.value, 0)
+        gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
+        promises, ball = screened_promises(
+            screened, value, gradient, self.kernel, self.size, epsilon
+        )
+        return Sample(
+            value,
+            gradient / self.size,
+            promises,
+            dr.select(is_off_dipole, error, _ANY_LEVEL),
+            dr.select(is_off_dipole, slope_error / self.size, 0),
+            truncation_error=dr.select(is_off_dipole, sums.truncation, 0),
+            alternative_promises=(ball,),
+        )

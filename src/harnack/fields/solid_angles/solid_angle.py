@@ -11,7 +11,6 @@ precision."""
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import math
@@ -28,10 +27,12 @@ from harnack.backend.validation import check_length_range
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
+from harnack.fields.batched_fields import cached_upload
 from harnack.fields.capabilities import Boundary, VariableAccuracy
-from harnack.fields.clearance import DeviceField, tight_extent
+from harnack.fields.clearance import tight_extent
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Ray, RaySample, Sample, space_scaled
-from harnack.fields.solid_angles.cell_options import FieldWithCells
+from harnack.fields.solid_angles.cell_options import NO_CELLS, CellChoice, FieldWithCells
 from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
 from harnack.fmm.circle_sums import CircleSet, CircleSums
 from harnack.fmm.curve_cell_builder import build_curve_cells
@@ -62,12 +63,10 @@ from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Self
 
     import numpy.typing as npt
 
     from harnack.backend import Backend, Mask, Precision, Real, Vec3
-    from harnack.fields.field import Field
     from harnack.geometry import Volume
 
 LiftBoundName = Literal["auto", "planar", "edges", "convex", "paper"]
@@ -89,7 +88,7 @@ _MIN_WORK, _MIN_RAYS, _MIN_EDGES = 2.5e8, 1e6, 48
 _MAX_PLANES = 48
 
 
-class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
+class SolidAngle(FieldWithCells):
     """The signed solid angle f of closed curves, in steradians, with period 4 pi (paper, Eq. 10).
     "The curve" means all loops together. Promises are proved bounds of f near a point.
 
@@ -130,10 +129,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         vertices. In a cell, near edges are summed directly, and all others are one polynomial with
         a proved remainder. So an evaluation for tracing costs about the same time whatever the
         number of edges. Where the result depends on the remainder, all edges are summed. None
-        builds cells where they save time (`for_ray_count`), True always, False never. They take
+        builds cells where they save time (`cells_pay_from`), True always, False never. They take
         some 2 to 10 MB, at most the number of megabytes of this argument (True: 256). If that is
-        too small, there are no cells, and `describe` of a prepared field reports this. They are
-        built at the first trace, for each precision, which takes as long as tracing some 200,000 to
+        too small, there are no cells, and `describe` of an evaluator reports this. They are built
+        at the first trace, for each precision, which takes as long as tracing some 200,000 to
         600,000 camera rays without cells. Circles have no cells. Values and derivatives at points
         are those of all edges.
 
@@ -190,9 +189,6 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
                 "NumPy arrays, or no cells"
             )
-        self._has_cells = bool(cells) and bool(self._net_loops)
-        # The accuracy scale of samples.
-        self._detail: Real = 1.0
 
     @property
     def loops(self) -> Loops:
@@ -268,11 +264,39 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             )
         return "edges" if option == "edges" else "range"
 
-    def _upload(self, backend: Backend, *, traced: bool) -> _CurveData:
+    @property
+    def has_variable_accuracy(self) -> bool:
+        """Whether samples come from FMM cells whatever the number of rays."""
+        return bool(self._cell_choice(0))
+
+    def _cell_choice(self, ray_count: int) -> CellChoice:
+        """The FMM cells with which to trace `ray_count` rays. Circles alone have no cells."""
+        return self.cell_choice(ray_count) if self._net_loops else NO_CELLS
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> CurveEvaluator:
+        cells = self._cell_choice(plan.ray_count)
+        return self._evaluator_of(self._upload(backend, traced=True, cells=cells))
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """A sample of f at points p, from all edges."""
+        return self._evaluator_of(self._point_data(backend_of(p))).evaluate(p)
+
+    def _evaluator_of(self, data: _CurveData) -> CurveEvaluator:
+        """The evaluator that samples f by these data of the curve on a backend."""
+        # If vertices can move one by one, all edges are summed: after a move they may not cancel.
+        return CurveEvaluator(self, data, self._differentiable_loops or self._net_loops)
+
+    def _point_data(self, backend: Backend) -> _CurveData:
+        """The curve on a backend for values at points, which come from all edges."""
+        return self._upload(backend, traced=False, cells=NO_CELLS)
+
+    @cached_upload
+    def _upload(self, backend: Backend, *, traced: bool, cells: CellChoice) -> _CurveData:
         """Copy the curve to a backend, in unit coordinates: its center at 0, its radius 1.
 
-        traced: True for tracing rays, for which FMM cells are built if the field has them; False
-            for values at points, which come from all edges.
+        traced: whether the data are for tracing rays, and not for values at points, which may be of
+            smaller curves.
+        cells: the FMM cells of the curve.
 
         Raises ValueError if coordinates are so large that they could overflow in the backend's
         precision.
@@ -312,10 +336,10 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         value_rounding = (
             16 * backend.machine_epsilon if edges is None else edges.rounding(record_count)
         )
-        cells = None
-        if self._has_cells and traced:
+        curve_cells = None
+        if cells:
             low, high = self._box(center)
-            cells = build_curve_cells(backend, unit_loops, low, high, self.max_bytes())
+            curve_cells = build_curve_cells(backend, unit_loops, low, high, cells.max_bytes)
         # The number of roundings of a position: `_CurveData.rounding` lists them.
         return _CurveData(
             *frame_parameters(backend, center, self._size),
@@ -324,6 +348,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             plane,
             dr.opaque(backend.Float, backend.machine_epsilon * (6 + 2 * magnitude)),
             dr.opaque(backend.Float, value_rounding),
+            self._region,
+            len(self._net_circles),
+            curve_cells,
             cells,
         )
 
@@ -341,16 +368,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
     @functools.cached_property
     def _without_cells(self) -> SolidAngle:
         """The same field without FMM cells; this field itself if it has none."""
-        if not self._has_cells:
+        if not self.cell_choice():
             return self
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
-
-    def _data_for(self, p: Vec3) -> _CurveData:
-        """The curve on the device, for points p in user coordinates. If `prepare` was not called,
-        the curve is uploaded now, without FMM cells, to the backend of p."""
-        if self._device is None:
-            return self._upload(backend_of(p), traced=False)
-        return self._device
 
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]
@@ -358,212 +378,14 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         """Evaluate the field at points (n, 3), and return what the function `choose` takes from
         each sample, such as its value. A field with FMM cells uses the same field without cells,
         because values at points are sums over all edges."""
-        if self._has_cells:
+        if self.cell_choice():
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        return VariableAccuracy(self._at_accuracy) if self._has_cells else None
-
-    def _at_accuracy(self, detail: Real) -> Field:
-        """The same field with samples of this accuracy scale. Samples come from FMM cells at scales
-        up to 1, and from all edges at larger ones, which are more accurate."""
-        field = copy.copy(self)
-        field._detail = detail
-        return field
-
-    def evaluate(self, p: Vec3) -> Sample:
-        """A sample of f at points p in user coordinates: value, gradient, error bounds and proved
-        bounds of f near p."""
-        return self._sample(p, None)
-
-    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """A sample of f at the ray parameter t, with proved bounds of how f changes along the ray
-        in front of that point and behind it. If the ray runs along an edge of the curve, bounds for
-        the line of the ray prove much longer steps than bounds for a ball around the point.
-
-        path: the ray.
-        ahead, back: the lengths of the ray in front of the point and behind it for which bounds are
-            wanted. They are not used: the bounds state their own lengths.
-        """
-        del ahead, back
-        has_line_bounds = not self._all_cancel and self.lift_bound_option != "paper"
-        direction = path.direction if has_line_bounds else None
-        return path.enclose(self._sample(path.point(t), direction))
-
-    def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
-        """A sample of f at points p in user coordinates: value, gradient, error bounds, and
-        promises (proved bounds of f near p). At the curve itself, where f has no single value, the
-        value is 0 and the gradient is so steep that p counts as close to any level.
-
-        direction: (3,) a unit vector. The sample gets further bounds along the line through p in
-            this direction; None for no such bounds.
-        """
-        data = self._data_for(p)
-        if self._all_cancel:
-            return self._zero_sample(data, p)
-        x = data.to_unit(p)
-        sums, errors = data.at_detail(x, self._detail)
-        # errors.value and errors.slope bound the truncation errors of f and its gradient, and
-        # errors.rounding the rounding of f. sums.inverse_squares, inverse_cubes and inverse_fourths
-        # are the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance
-        # from x.
-        epsilon = data.backend.machine_epsilon
-        rounding = data.rounding
-        # A lower bound of the distance to the curve, also after rounding.
-        distance = sums.distance * (1 - SUM_MARGIN) - rounding
-        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
-        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.inverse_squares)
-        if self.lift_bound == "edges":
-            ball = lift_ball(
-                sums.angle, sums.gradient, sums.inverse_squares, promises, errors.slope
-            )
-        elif self.lift_bound == "planar":
-            ball = self._planar_ball(data, x, sums, distance, errors.value)
-        else:
-            ball = _convex_ball(sums.angle, distance, errors.value + value_rounding)
-        # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
-        # the sample has a gradient so steep that the point counts as close to any level. Anywhere
-        # else NaN stays NaN, and the tracer accepts no such point.
-        is_on_curve = sums.distance <= 2 * rounding
-        steep_gradient = data.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
-        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
-        gradient_error = errors.slope
-        truncation = dr.select(is_on_curve, 0, errors.value)
-        error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
-        if sums.circles is not None:
-            circles = sums.circles
-            # Measured errors: 15 units in the last place of a circle's angle, and 60 of its
-            # gradient near the circle (10 elsewhere). Its position is rounded by a few units too.
-            point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
-            # `value` is the bound for the angle.
-            value = 16 * epsilon * len(self._net_circles) + point_error * circles.inverse_squares
-            error = error + dr.select(is_on_curve, 0, value)
-            circle_gradient_error = (
-                32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
-            )
-            gradient_error = gradient_error + circle_gradient_error
-        gradient_error = dr.select(is_on_curve, 0, gradient_error)
-        error = dr.select(is_on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
-        ray_promises = _line_bounds(data, x, sums, errors, direction)
-        # "paper" promises nothing but the range on the ball.
-        if self.lift_bound_option == "paper":
-            promises = (ball,)
-        value = dr.select(is_on_curve, 0, sums.angle)
-        # All of this is in unit coordinates; `space_scaled` converts it to user coordinates.
-        sample = Sample(
-            value,
-            gradient,
-            promises,
-            error,
-            gradient_error,
-            truncation_error=truncation,
-            alternative_promises=(ball,),
-            ray_promises=ray_promises,
-        )
-        return space_scaled(sample, data.size)
-
-    def _planar_ball(
-        self, data: _CurveData, x: Vec3, sums: CurveSums, distance: Real, error: Real
-    ) -> HarmonicBall:
-        """A ball around each point x that meets no curve, and a range of the lift of f on it, for
-        `lift_bound="planar"`. The range comes from the region of a plane that the curve bounds, or
-        from the circles if there are only circles.
-
-        data: the curve on a backend.
-        x: the points, in unit coordinates.
-        sums: the sums over edges and circles at x.
-        distance: a lower bound of the distance from x to the curve, in unit coordinates.
-        error: a bound of the truncation error of f.
-        """
-        if self._region is None:
-            circles = sums.circles
-            assert circles is not None
-            return HarmonicBall(distance, circles.lower, circles.upper)
-        height_rounding = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
-        return self._region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
-
-    def _zero_sample(self, data: _CurveData, p: Vec3) -> Sample:
-        """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
-        It promises a range of f on a ball much larger than the curve. The range has a positive
-        width, because formulas divide by the width. It contains no level, because levels that are
-        multiples of 4 pi are refused (`validate_levels`).
-
-        data: the curve on a backend, whose size gives the unit of length.
-        """
-        x = data.to_unit(p)
-        radius = 1e6 * (1 + dr.norm(x)) * data.size
-        zero = dr.zeros(data.backend.Float, dr.width(p))
-        ball = HarmonicBall(radius, zero - _LEVEL_MARGIN, zero + _LEVEL_MARGIN)
-        return Sample(zero, data.backend.Array3f(zero), (ball,))
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The Hessian of f at points p, as three vectors: its rows. Its trace is 0 up to rounding.
-        Its entries grow without limit towards the curve."""
-        data = self._data_for(p)
-        if self._all_cancel:
-            zero = dr.zeros(data.backend.Array3f, dr.width(p))
-            return zero, zero, zero
-        x, scale = data.to_unit(p), 1 / (data.size * data.size)
-        # Second derivatives in unit coordinates; `scale` converts them to user coordinates.
-        rows = data.backend.Array3f(0), data.backend.Array3f(0), data.backend.Array3f(0)
-        if data.edges is not None:
-            rows = hessian_over_edges(data.edges, x)
-        if data.circles is not None:
-            circle_rows = data.circles.hessian(x).rows(data.backend.Array3f)
-            rows = tuple(
-                edge_row + circle_row
-                for edge_row, circle_row in zip(rows, circle_rows, strict=True)
-            )
-        first, second, third = (row * scale for row in rows)
-        return first, second, third
-
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two proved bounds of rounding errors at points p: of the length of the gradient's error,
-        and of the error of each second derivative. The errors come from the rounding of positions.
-        The bounds are those of sums over boundary edges (`source_sums.SLOPE_ROUNDINGS`), with
-        distances reduced by their rounding. They are infinite at the curve.
-
-        sample: not used; the sums are computed again.
-        """
-        del sample
-        data = self._data_for(p)
-        if self._all_cancel:
-            return 0.0, 0.0
-        x = data.to_unit(p)
-        sums, unit = data.sums(x), coordinate_rounding(x)
-        distance = sums.distance - 4 * unit
-        # The second condition is that of `_sample`.
-        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
-        # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
-        growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
-        # With the integrals I3 (`inverse_cubes`) and I4 of |dp|/D^3 and |dp|/D^4 the sums of
-        # `source_sums` are s4 = I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance.
-        # The factors 1/3 and 1/4 in their places are a little larger.
-        gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
-        second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
-        return gradient_error, second_error / (data.size * data.size)
-
-    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A proved bound of |grad f(q) - grad f(p)| for all points q within the distance `radius`
-        of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
-        data = self._data_for(p)
-        if self._all_cancel:
-            return 0 * p.x  # f is constant: 0 on each lane
-        x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
-        # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
-        sums = data.sums(x)
-        distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
-        return (
-            gradient_change_bound(sums.inverse_cubes, sums.inverse_fourths, distance, unit_radius)
-            / data.size
-        )
 
     def _closest_on_curve(self, p: Vec3) -> Vec3:
         """The point of the curve that is closest to p, in user coordinates. Edges that cancel each
         other do not count (`remaining_edges`)."""
-        data = self._data_for(p)
+        data = self._point_data(backend_of(p))
         x = data.to_unit(p)
         # The closest point so far, in unit coordinates, and its squared distance.
         nearest, square = data.backend.Array3f(0), data.backend.Float(dr.inf)
@@ -583,29 +405,11 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         loops = (*(self._differentiable_loops or self._loops), *self.circles)
         return {**super().constructor_arguments(), "loops": loops}
 
-    def differentiable_value(self, p: Vec3) -> Real:
-        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
-        the vertices of loops."""
-        backend = backend_of(p)
-        # If vertices can move one by one, all edges are summed: after a move they may not cancel.
-        loops = self._differentiable_loops or self._net_loops
-        angle = differentiable_angle(backend, loops, p)
-        data = self._data_for(p)
-        if data.circles is None:
-            return angle
-        # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
-        # Its value is right, as q has the coordinates of p.
-        with dr.suspend_grad():
-            q = dr.detach(p)
-            sums = data.circles.sums(data.to_unit(q))
-        return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
-
     def _continuous_change(self, p: FloatArray, q: FloatArray) -> FloatArray:
         """The change (n,) of the solid angle along the segments from points p (n, 3) to q (n, 3),
         followed continuously, so that it may exceed 4 pi. It is for curves without circles."""
         backend = choose_backend("double")
-        # The point 0 only tells the backend.
-        data = self._without_cells.prepare(backend)._data_for(backend.Array3f(0))
+        data = self._upload(backend, traced=True, cells=NO_CELLS)
         if data.edges is None:
             return np.zeros(len(p))
         edges = data.edges
@@ -665,7 +469,9 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # way. No number is farther than 2 pi from all multiples of 4 pi: if `nearest` is 2 pi, all
         # levels are 2 pi modulo 4 pi.
         is_in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
-        if is_in_hull and self._has_cells:  # some half-spaces of the hull: all of it lies in them
+        if is_in_hull and self._cell_choice(
+            0
+        ):  # some half-spaces of the hull: all of it lies in them
             hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
             planes = slice(_MAX_PLANES)
             return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
@@ -683,12 +489,6 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
         # box.
         vertices = sum(map(len, self._net_loops)) + 3 * len(self._net_circles)
         return tight_extent(proved, levels, lower, upper, max(8, _MAX_PAIRS // vertices))
-
-    def with_cells(self, cells: bool = True) -> Self:
-        """The same field with FMM cells, or without them if `cells` is False."""
-        field = super().with_cells(cells)
-        field._has_cells, field._extents = cells, TransientCache()
-        return field
 
     def cells_pay_from(self) -> float:
         """The smallest number of rays for which FMM cells save more time than it takes to build
@@ -708,8 +508,230 @@ class SolidAngle(FieldWithCells, DeviceField["_CurveData"]):
             "canceled edges": sum(map(len, self.loops)) - sum(map(len, self._net_loops)),
             "convex position": self.convex_position,
             "lift_bound": self.lift_bound,
-            **self.describe_cells(None if self._device is None else self._device.cells),
+            **self.describe_cell_option(),
         }
+
+
+class CurveEvaluator(Evaluator):
+    """The evaluator of a `SolidAngle`.
+
+    field: the field.
+    data: the curve on the backend.
+    loops: the polygons of which derivatives by vertices are computed.
+    detail: the accuracy scale of samples; larger is more accurate. At scales up to 1 samples come
+        from FMM cells, if there are any, and at larger ones from all edges.
+    """
+
+    def __init__(
+        self, field: SolidAngle, data: _CurveData, loops: tuple[Any, ...], detail: Real = 1.0
+    ) -> None:
+        self.field, self.data, self.loops, self.detail = field, data, loops, detail
+        if data.cells is not None:
+            at = functools.partial(CurveEvaluator, field, data, loops)
+            self.variable_accuracy = VariableAccuracy(at)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """A sample of f at points p in user coordinates: value, gradient, error bounds and proved
+        bounds of f near p."""
+        return self._sample(p, None)
+
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """A sample of f at the ray parameter t, with proved bounds of how f changes along the ray
+        in front of that point and behind it. If the ray runs along an edge of the curve, bounds for
+        the line of the ray prove much longer steps than bounds for a ball around the point.
+
+        path: the ray.
+        ahead, back: the lengths of the ray in front of the point and behind it for which bounds are
+            wanted. They are not used: the bounds state their own lengths.
+        """
+        del ahead, back
+        has_line_bounds = not self.data.is_empty and self.field.lift_bound_option != "paper"
+        direction = path.direction if has_line_bounds else None
+        return path.enclose(self._sample(path.point(t), direction))
+
+    def _sample(self, p: Vec3, direction: Vec3 | None) -> Sample:
+        """A sample of f at points p in user coordinates: value, gradient, error bounds, and
+        promises (proved bounds of f near p). At the curve itself, where f has no single value, the
+        value is 0 and the gradient is so steep that p counts as close to any level.
+
+        direction: (3,) a unit vector. The sample gets further bounds along the line through p in
+            this direction; None for no such bounds.
+        """
+        data = self.data
+        if data.is_empty:
+            return self._zero_sample(p)
+        x = data.to_unit(p)
+        sums, errors = data.at_detail(x, self.detail)
+        # errors.value and errors.slope bound the truncation errors of f and its gradient, and
+        # errors.rounding the rounding of f. sums.inverse_squares, inverse_cubes and inverse_fourths
+        # are the integrals of |dp|/D^2, |dp|/D^3 and |dp|/D^4 over the curve, with D the distance
+        # from x.
+        epsilon = data.backend.machine_epsilon
+        rounding = data.rounding
+        # A lower bound of the distance to the curve, also after rounding.
+        distance = sums.distance * (1 - SUM_MARGIN) - rounding
+        promises = remainder_promises(sums.inverse_cubes, sums.inverse_fourths, distance)
+        value_rounding = errors.rounding + vertex_rounding(epsilon, x, sums.inverse_squares)
+        if self.field.lift_bound == "edges":
+            ball = lift_ball(
+                sums.angle, sums.gradient, sums.inverse_squares, promises, errors.slope
+            )
+        elif self.field.lift_bound == "planar":
+            ball = self._planar_ball(x, sums, distance, errors.value)
+        else:
+            ball = _convex_ball(sums.angle, distance, errors.value + value_rounding)
+        # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
+        # the sample has a gradient so steep that the point counts as close to any level. Anywhere
+        # else NaN stays NaN, and the tracer accepts no such point.
+        is_on_curve = sums.distance <= 2 * rounding
+        steep_gradient = data.backend.Array3f(0, 0, 4 * _PERIOD / rounding)
+        gradient = dr.select(is_on_curve, steep_gradient, sums.gradient)
+        gradient_error = errors.slope
+        truncation = dr.select(is_on_curve, 0, errors.value)
+        error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
+        if sums.circles is not None:
+            circles = sums.circles
+            # Measured errors: 15 units in the last place of a circle's angle, and 60 of its
+            # gradient near the circle (10 elsewhere). Its position is rounded by a few units too.
+            point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
+            # `value` is the bound for the angle.
+            value = 16 * epsilon * data.circle_count + point_error * circles.inverse_squares
+            error = error + dr.select(is_on_curve, 0, value)
+            circle_gradient_error = (
+                32 * epsilon * circles.inverse_squares + 1.5 * point_error * circles.inverse_cubes
+            )
+            gradient_error = gradient_error + circle_gradient_error
+        gradient_error = dr.select(is_on_curve, 0, gradient_error)
+        error = dr.select(is_on_curve, 8 * _PERIOD, error)  # the steep gradient times 2 rounding
+        ray_promises = _line_bounds(data, x, sums, errors, direction)
+        # "paper" promises nothing but the range on the ball.
+        if self.field.lift_bound_option == "paper":
+            promises = (ball,)
+        value = dr.select(is_on_curve, 0, sums.angle)
+        # All of this is in unit coordinates; `space_scaled` converts it to user coordinates.
+        sample = Sample(
+            value,
+            gradient,
+            promises,
+            error,
+            gradient_error,
+            truncation_error=truncation,
+            alternative_promises=(ball,),
+            ray_promises=ray_promises,
+        )
+        return space_scaled(sample, data.size)
+
+    def _planar_ball(self, x: Vec3, sums: CurveSums, distance: Real, error: Real) -> HarmonicBall:
+        """A ball around each point x that meets no curve, and a range of the lift of f on it, for
+        `lift_bound="planar"`. The range comes from the region of a plane that the curve bounds, or
+        from the circles if there are only circles.
+
+        x: the points, in unit coordinates.
+        sums: the sums over edges and circles at x.
+        distance: a lower bound of the distance from x to the curve, in unit coordinates.
+        error: a bound of the truncation error of f.
+        """
+        data = self.data
+        if data.region is None:
+            circles = sums.circles
+            assert circles is not None
+            return HarmonicBall(distance, circles.lower, circles.upper)
+        height_rounding = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
+        return data.region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
+
+    def _zero_sample(self, p: Vec3) -> Sample:
+        """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
+        It promises a range of f on a ball much larger than the curve. The range has a positive
+        width, because formulas divide by the width. It contains no level, because levels that are
+        multiples of 4 pi are refused (`validate_levels`)."""
+        data = self.data
+        x = data.to_unit(p)
+        radius = 1e6 * (1 + dr.norm(x)) * data.size
+        zero = dr.zeros(data.backend.Float, dr.width(p))
+        ball = HarmonicBall(radius, zero - _LEVEL_MARGIN, zero + _LEVEL_MARGIN)
+        return Sample(zero, data.backend.Array3f(zero), (ball,))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The Hessian of f at points p, as three vectors: its rows. Its trace is 0 up to rounding.
+        Its entries grow without limit towards the curve."""
+        data = self.data
+        if data.is_empty:
+            zero = dr.zeros(data.backend.Array3f, dr.width(p))
+            return zero, zero, zero
+        x, scale = data.to_unit(p), 1 / (data.size * data.size)
+        # Second derivatives in unit coordinates; `scale` converts them to user coordinates.
+        rows = data.backend.Array3f(0), data.backend.Array3f(0), data.backend.Array3f(0)
+        if data.edges is not None:
+            rows = hessian_over_edges(data.edges, x)
+        if data.circles is not None:
+            circle_rows = data.circles.hessian(x).rows(data.backend.Array3f)
+            rows = tuple(
+                edge_row + circle_row
+                for edge_row, circle_row in zip(rows, circle_rows, strict=True)
+            )
+        first, second, third = (row * scale for row in rows)
+        return first, second, third
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Two proved bounds of rounding errors at points p: of the length of the gradient's error,
+        and of the error of each second derivative. The errors come from the rounding of positions.
+        The bounds are those of sums over boundary edges (`source_sums.SLOPE_ROUNDINGS`), with
+        distances reduced by their rounding. They are infinite at the curve.
+
+        sample: not used; the sums are computed again.
+        """
+        del sample
+        data = self.data
+        if data.is_empty:
+            return 0.0, 0.0
+        x = data.to_unit(p)
+        sums, unit = data.sums(x), coordinate_rounding(x)
+        distance = sums.distance - 4 * unit
+        # The second condition is that of `_sample`.
+        is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
+        # By this factor |dp|/D^4 can grow if the distance D is reduced by its rounding.
+        growth = dr.select(is_off_curve, dr.square(dr.square(sums.distance / distance)), dr.inf)
+        # With the integrals I3 (`inverse_cubes`) and I4 of |dp|/D^3 and |dp|/D^4 the sums of
+        # `source_sums` are s4 = I3/4 and s5 = 3 I4/16 (`LiftedEdge.bounds`), and I4 <= I3/distance.
+        # The factors 1/3 and 1/4 in their places are a little larger.
+        gradient_error = SLOPE_ROUNDINGS / 3 * unit * sums.inverse_cubes * growth / data.size
+        second_error = 0.25 * SECOND_ROUNDINGS * unit * sums.inverse_cubes / sums.distance * growth
+        return gradient_error, second_error / (data.size * data.size)
+
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
+        """A proved bound of |grad f(q) - grad f(p)| for all points q within the distance `radius`
+        of p (`curve_queries.gradient_change_bound`). It includes the rounding of positions."""
+        data = self.data
+        if data.is_empty:
+            return 0 * p.x  # f is constant: 0 on each lane
+        x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
+        # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
+        sums = data.sums(x)
+        distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
+        return (
+            gradient_change_bound(sums.inverse_cubes, sums.inverse_fourths, distance, unit_radius)
+            / data.size
+        )
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of loops."""
+        backend = backend_of(p)
+        angle = differentiable_angle(backend, self.loops, p)
+        data = self.data
+        if data.circles is None:
+            return angle
+        # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
+        # Its value is right, as q has the coordinates of p.
+        with dr.suspend_grad():
+            q = dr.detach(p)
+            sums = data.circles.sums(data.to_unit(q))
+        return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
+
+    def describe(self) -> dict[str, Any]:
+        """The facts of `SolidAngle.describe`, with the number and the memory of the FMM cells that
+        were built."""
+        return self.field.describe() | self.data.cell_choice.describe(self.data.cells)
 
 
 @dataclass(frozen=True)
@@ -725,8 +747,11 @@ class _CurveData(UnitFrame):
         rounded once, at the curve's distance from 0.
     value_rounding: a bound of the rounding of the solid angle, which depends on the number of edges
         (`LoopEdges.rounding`).
+    region: that region; None if there is none.
+    circle_count: the number of circles.
     cells: the FMM cells, each with its near edges and a polynomial for all other edges; None for no
         cells.
+    cell_choice: the cells that the curve was to have.
     """
 
     edges: LoopEdges | None
@@ -734,7 +759,15 @@ class _CurveData(UnitFrame):
     plane: tuple[Real, ...] | None
     rounding: Real
     value_rounding: Real
-    cells: CurveCells | None = None
+    region: PlanarRegion | None
+    circle_count: int
+    cells: CurveCells | None
+    cell_choice: CellChoice
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether all edges and circles cancel each other, so that f is 0 everywhere."""
+        return self.edges is None and self.circles is None
 
     def at_detail(self, x: Vec3, detail: Real) -> tuple[CurveSums, CellErrors]:
         """Return the sums over all edges and circles at points x in unit coordinates, and bounds of
