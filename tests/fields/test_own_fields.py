@@ -277,26 +277,25 @@ class Rounded(Field):
 
     default_level = 0.3
     domain = hk.Ball(radius=2.0)
+    has_variable_accuracy = True
 
     def __init__(self, power: float) -> None:
         self.power = power
 
     def evaluate(self, p: Any) -> Sample:
-        return self.variable_accuracy.at(1.0 + 0 * p.x).evaluate(p)
+        return self.at(1.0 + 0 * p.x).evaluate(p)
 
-    @property
-    def variable_accuracy(self) -> hk.fields.VariableAccuracy:
-        def at(scale: Any) -> Field:
-            off = 0.5 * dr.maximum(scale, 0.25) ** -self.power
-            off = dr.select(scale < 1e5, off, 0)
-            known = (Lipschitz(1.0),)
-            return hk.fields.EvaluateOnly(
-                lambda p: Sample(
-                    p.x + off, type(p)(1.0, 0.0, 0.0), known, off, truncation_error=off
-                )
-            )
+    def at(self, scale: Any) -> hk.fields.Evaluator:
+        off = 0.5 * dr.maximum(scale, 0.25) ** -self.power
+        off = dr.select(scale < 1e5, off, 0)
+        known = (Lipschitz(1.0),)
+        return hk.fields.EvaluateOnly(
+            lambda p: Sample(p.x + off, type(p)(1.0, 0.0, 0.0), known, off, truncation_error=off)
+        )
 
-        return hk.fields.VariableAccuracy(at, coarsest=0.25)
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        accuracy = hk.fields.VariableAccuracy(self.at, coarsest=0.25)
+        return hk.fields.SampleEvaluator(self, backend, variable_accuracy=accuracy)
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 3.0, 6.0])

@@ -9,7 +9,19 @@ import drjit as dr
 import pytest
 
 import harnack as hk
-from harnack.fields import NO_FACET, Field, JumpCrossing, Jumps, Sample
+from harnack.backend import Backend
+from harnack.fields import (
+    NO_FACET,
+    EvaluateOnly,
+    Evaluator,
+    Field,
+    JumpCrossing,
+    Jumps,
+    Plan,
+    Sample,
+    SampleEvaluator,
+)
+from harnack.fields.evaluator import POINTS
 from harnack.proofs import Lipschitz
 from harnack.testing import BrokenPromiseError, check_field
 
@@ -46,13 +58,14 @@ class Plane(Jumps):
         return dr.select((x > 0) | ((x == 0) & (d.x > 0)), type(x)(HEIGHT), 0)
 
     def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
-        return Shell(offset)
+        return EvaluateOnly(Shell(offset).evaluate)
 
 
 class Step(Field):
     """|p| - 1, and `HEIGHT` more where x > 0."""
 
     domain = hk.Ball(radius=2.0)
+    has_jumps = True
 
     def __init__(self, plane: Jumps) -> None:
         self.plane = plane
@@ -60,9 +73,8 @@ class Step(Field):
     def evaluate(self, p: Any) -> Sample:
         return Shell(dr.select(p.x > 0, type(p.x)(HEIGHT), 0)).evaluate(p)
 
-    @property
-    def jumps(self) -> Jumps:
-        return self.plane
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        return SampleEvaluator(self, backend, jumps=self.plane)
 
 
 class NoOffset(Jumps):
@@ -72,12 +84,12 @@ class NoOffset(Jumps):
 
 class TooMuch(Plane):
     def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
-        return Shell(offset + 0.3)
+        return EvaluateOnly(Shell(offset + 0.3).evaluate)
 
 
 class TooFlat(Plane):
     def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
-        return Shell(offset, 0.2)
+        return EvaluateOnly(Shell(offset, 0.2).evaluate)
 
 
 class Single(Plane):
@@ -161,16 +173,21 @@ def test_wrong_jumps_are_found(plane: type[Jumps], message: str) -> None:
 def test_other_types_are_refused_by_name() -> None:
     """A number as the continuation: 'int' object has no attribute 'variable_accuracy'."""
 
-    class NoField(Plane):
+    class NoEvaluator(Plane):
         def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
             return 3
+
+    class NoSamples(Plane):
+        def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
+            return Shell(offset)
 
     class NoCrossing(Plane):
         def next_crossing(self, o: Any, d: Any, after: Any, t_max: Any, active: Any) -> Any:
             return 1.0
 
     for plane, message in (
-        (NoField(), "NoField.continuation returned an object of type int: return a field"),
+        (NoEvaluator(), "NoEvaluator.continuation returned an object of type int: return a har"),
+        (NoSamples(), "object of type Shell, a field, which describes f: return what samples f"),
         (NoCrossing(), "NoCrossing.next_crossing returned an object of type float: return har"),
     ):
         with pytest.raises(TypeError, match=message):

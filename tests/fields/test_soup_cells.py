@@ -52,9 +52,8 @@ def soup(mesh: Mesh, cells: Any = True) -> hk.WindingNumber:
     return hk.WindingNumber(*mesh, method="tree", cells=cells)
 
 
-def cells_of(prepared: hk.WindingNumber) -> DipoleCells:
-    assert prepared._device is not None
-    cells = prepared._device.built
+def cells_of(field: hk.WindingNumber, precision: Any = "single") -> DipoleCells:
+    cells = field.traced_data(choose_backend(precision)).built
     assert isinstance(cells, DipoleCells)
     return cells
 
@@ -77,12 +76,12 @@ def test_samples_are_within_their_errors(
     if kind == "large":  # near them are leaves whose balls are not
         monkeypatch.setattr(dipole_cells, "_MOST_NEAR", 24)
     mesh, backend = MESHES[kind], choose_backend(precision)
-    field = soup(mesh).prepare(backend)
-    cells = cells_of(field)
+    field = soup(mesh)
+    cells = cells_of(field, precision)
     assert cells.count > 8
     middle = rounded(mesh[0].mean(axis=0, keepdims=True))
     x = rounded(middle + places((mesh[0] - middle, mesh[1]), 3000, 1e-4))
-    sample = field.evaluate(to_vector3(backend, x))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, x))
     plain = soup(mesh, False)
     gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
     steep = np.linalg.norm(gradient, axis=1)
@@ -106,13 +105,13 @@ def test_errors_are_attained(monkeypatch: pytest.MonkeyPatch) -> None:
     large = np.array([[0.0, 0, 0], [0.2, 0, 0.1], [0, 0.25, 0]])
     corners = np.stack([small, small + 0.5, large + np.array([0.6, -0.6, 0.6])])
     field = soup((corners.reshape(-1, 3), np.arange(9).reshape(-1, 3)))
-    prepared = field.prepare(choose_backend("double"))
-    cells = cells_of(prepared)
+    cells = cells_of(field, "double")
     table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
     away = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     unit_x = table[:, None, :3] + away / math.sqrt(3) / 1.0041 / table[:, None, 3:4]
     x = field.mesh.center + field.mesh.size * unit_x.reshape(-1, 3)
-    sample = prepared.evaluate(to_vector3(choose_backend("double"), x))
+    backend = choose_backend("double")
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, x))
     off = np.abs(to_numpy(sample.value) - direct_sum(corners, x))
     used = off / to_numpy(sample.value_error)
     assert used.max() <= 1
@@ -128,7 +127,7 @@ def test_the_bound_of_bending_is_attained(monkeypatch: pytest.MonkeyPatch) -> No
     places = np.array([[0.3, 0.3, 0.3], [1.0, -1.0, 1.0], [-1.0, 1.0, -1.0]])
     corners = tiny + places[:, None]
     field = soup((corners.reshape(-1, 3), np.arange(9).reshape(-1, 3)))
-    cells = cells_of(field.prepare(choose_backend("double")))
+    cells = cells_of(field, "double")
     table = to_numpy(cells.records.buffer).reshape(cells.count, -1)
     c = table[table[:, 13] == 0, :3]  # no near triangles
     x = to_vector3(choose_backend("double"), c)
@@ -180,7 +179,7 @@ def test_rounding_of_positions_counts_where_all_is_far(kind: str) -> None:
         field = hk.DipolePotential(points, normals, areas, cells=True)
         away, moments = x[:, None] - points, field.normals * field.areas[:, None]
         exact = -((moments * away).sum(axis=2) / np.linalg.norm(away, axis=2) ** 3).sum(axis=1)
-    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, x))
     scale = 4 * math.pi if kind == "triangles" else 1.0
     off = np.abs(scale * to_numpy(sample.value).astype(np.float64) - exact)
     steep = scale * np.linalg.norm(to_numpy(sample.gradient), axis=1)
@@ -227,7 +226,7 @@ def test_rays_from_inside_far_away_and_along_faces_of_cells() -> None:
     o, d = rng.uniform(-0.6, 0.6, (1000, 3)), unit(rng.normal(size=(1000, 3)))
     compare(mesh, o, d, t_min=0.3)
     compare(mesh, o - 1e3 * d, d, precision="double")
-    cells = cells_of(soup(mesh).prepare(choose_backend("single")))
+    cells = cells_of(soup(mesh))
     table = to_numpy(cells.records.buffer).reshape(cells.count, -1).astype(np.float64)
     some = table[rng.integers(cells.count, size=1000)]
     corner = some[:, :3] + rng.choice([-1, 1], (1000, 3)) / (1.004 * math.sqrt(3)) / some[:, 3:4]
@@ -276,7 +275,7 @@ def test_when_there_are_cells_of_triangles() -> None:
     assert prepared.modulo_one is None
     short = soup(mesh, 0.01).prepare(choose_backend("single"))
     assert short.describe()["cells"] == "none, as they need more memory"
-    coarse = cells_of(soup(mesh, 2.0).prepare(choose_backend("single")))
+    coarse = cells_of(soup(mesh, 2.0))
     assert coarse.size <= 2e6 < cells.size
 
 
@@ -286,10 +285,9 @@ def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
     """Where triangles are as large as all of the soup, all of them are near."""
     vertices, faces = bumpy_sphere(2)
     for mesh in (scattered(300, 0.5), (vertices, remove_faces(faces, 0.1, 0))):
-        prepared = soup(mesh).prepare(choose_backend("single"))
-        assert prepared._device is not None
-        assert prepared._device.cells is not None
-        assert prepared.modulo_one is not None
+        field, backend = soup(mesh), choose_backend("single")
+        assert field.traced_data(backend).cells is not None
+        assert field.evaluator(backend).modulo_one is not None
     monkeypatch.setattr(winding_number, "_MOST_OF_SOUP", 100)
     assert soup(torn(2, 0.01), None).for_ray_count(10**9).cells is None
     assert soup(icosphere(1), True).prepare(choose_backend("single")).describe()["triangles"] == 80

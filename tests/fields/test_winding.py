@@ -411,7 +411,7 @@ def test_lattices_are_all_ties(count: int, precision: Any) -> None:
     steps = np.arange(-0.5, 5, 0.5)
     x = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     backend = choose_backend("double")
-    jumps = field.prepare(backend).jumps
+    jumps = field.evaluator(backend).jumps
     assert jumps is not None
     apart = to_numpy(jumps.distance(to_vector3(backend, x)))
     x = x[apart > 0.2]
@@ -726,7 +726,7 @@ def test_lifts_stay_within_their_promise(method: str) -> None:
     rng = np.random.default_rng(7)
     x = rng.uniform(-1.4, 1.4, (300, 3))
     backend = choose_backend("double")
-    sample = field.prepare(backend).evaluate(to_vector3(backend, x))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, x))
     ball = next(one for one in sample.all_promises if isinstance(one, HarmonicBall))
     value, radius = to_numpy(sample.value), to_numpy(ball.radius)
     room = np.stack([to_numpy(ball.lower) - value, to_numpy(ball.upper) - value])

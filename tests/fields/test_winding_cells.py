@@ -14,6 +14,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Levels, Lipschitz, choose_enclosures
 from harnack.enclosures.samples import Ray
 from harnack.fields import Sample
+from harnack.fields.solid_angles.winding_number import WindingModuloOne
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from harnack.tracer.branch_tracker import BranchTracker
 from tests.fields.test_winding import (
@@ -43,10 +44,9 @@ def modulo_one(numbers: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["holes", "soup"])
 def test_samples_in_cells_are_within_their_errors(kind: str, precision: Any) -> None:
     mesh = damaged(kind, 1)
-    field = with_cells(mesh, method="exact").prepare(choose_backend(precision))
-    backend = choose_backend(precision)
+    field, backend = with_cells(mesh, method="exact"), choose_backend(precision)
     x = places(mesh, 4000, 1e-4)
-    sample = field.evaluate_modulo_one(to_vector3(backend, x))
+    sample = WindingModuloOne(field).evaluator(backend).evaluate(to_vector3(backend, x))
     off = modulo_one(to_numpy(sample.value) - direct_sum(mesh[0][mesh[1]], x))
     gradient = hk.WindingNumber(*mesh, method="exact").gradient(x, precision="double")
     steep = np.linalg.norm(gradient, axis=1)
@@ -334,16 +334,16 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     middles of cells, as corners of the lattice are."""
     field, backend = with_cells(mesh), choose_backend(precision)
     field.extent((0.5,))
-    prepared = field.prepare(backend)
-    assert prepared._device is not None
-    assert prepared._device.cells is not None
+    modulo_one, cells = field.evaluator(backend).modulo_one, field.traced_data(backend).cells
+    assert modulo_one is not None
+    assert cells is not None
     rng, size, n = np.random.default_rng(6), float(np.ptp(mesh[0], axis=0).max()), 4000
     corners = mesh[0][mesh[1]]
     weights = rng.dirichlet((1, 1, 1), n) * ((rng.random((n, 3)) < 0.7) | [True, False, False])
     weights /= weights.sum(axis=1, keepdims=True)
     on = np.einsum("nk,nkd->nd", weights, corners[rng.integers(len(corners), size=n)])
     off = size * 10.0 ** rng.uniform(-7, -1, (n, 1)) * rng.normal(size=(n, 3))
-    centers = prepared._device.cells.cells.centers() * field.mesh.size + field.mesh.center
+    centers = cells.cells.centers() * field.mesh.size + field.mesh.center
     beside = rng.normal(size=(n, 3)) * (rng.random((n, 3)) < 0.4)
     points = np.concatenate([
         corners.mean(axis=(0, 1)) + size * rng.uniform(-0.5, 0.5, (n, 3)),
@@ -353,7 +353,7 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     ])  # fmt: skip
     points = points.astype(backend.dtype).astype(np.float64)
     x = to_vector3(backend, points)
-    found = prepared.modulo_one.value_if_cheap(x, backend.Float(0), backend.Bool(True))
+    found = modulo_one.value_if_cheap(x, backend.Float(0), backend.Bool(True))
     value = to_numpy(found).astype(np.float64)
     known = np.isfinite(value)
     assert known[:n].mean() > 0.9
@@ -369,10 +369,8 @@ def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
     mesh = corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)
     field = with_cells(mesh, method="tree", accuracy=1.5, order=0)
     field.extent((0.5,))
-    prepared = field.prepare(choose_backend("single"))
-    assert prepared._device is not None
-    assert prepared._device.cells is not None
-    cells = prepared._device.cells
+    cells = field.traced_data(choose_backend("single")).cells
+    assert cells is not None
     assert cells.size == cells.cells.size + 4 * cells.count
     poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13
     assert poor.mean() > 0.1

@@ -7,7 +7,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.solid_angles.winding_number import winding_box
+from harnack.fields.solid_angles.winding_number import WindingModuloOne, winding_box
 from harnack.fmm.edge_lift import LiftedEdges, lifted_sums
 from harnack.fmm.trail_sums import LiftedTrails, closed_trails
 from harnack.geometry.example_meshes import icosphere
@@ -62,9 +62,7 @@ def test_coarse_samples_are_w_less_a_whole_number(precision: str) -> None:
     x = np.random.default_rng(1).normal(size=(4000, 3))
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, x)
-    modulo_one = field.evaluator(backend).modulo_one
-    assert modulo_one is not None
-    sample = modulo_one.evaluate(p)
+    sample = WindingModuloOne(field).evaluator(backend).evaluate(p)
     error = to_numpy(backend.Float(sample.value_error))
     whole = winding_sum(field.mesh.vertices[field.mesh.triangles])(x)
     off = to_numpy(sample.value) - whole

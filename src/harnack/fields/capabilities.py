@@ -1,15 +1,18 @@
-"""Optional capabilities of a field. A field is a function f of space; its surface is a level set of
-f; a sample of it at a point is its value and gradient there, with proved bounds of f near the point
-("promises"). Each capability is an object, an attribute of the field, which is None for a field
-that lacks it:
+"""Optional capabilities of a field. A field describes a function f of space; its surface is a
+level set of f. An evaluator samples f on a backend (a Dr.Jit device and precision): a sample at a
+point is value and gradient of f there, with proved bounds of f near the point ("promises"). Each
+capability is an object, an attribute of the evaluator, which is None if f lacks it:
 
-- `Field.jumps`, a `Jumps`: f jumps across a surface made of facets, such as the triangles of a
+- `Evaluator.jumps`, a `Jumps`: f jumps across a surface made of facets, such as the triangles of a
   mesh.
-- `Field.modulo_one`, a `ModuloOne`: f can be sampled up to an unknown integer in less time.
-- `Field.patches`, a `Patches`: the surface is the union of many level sets (patches), each of its
-  own function and inside its own box.
+- `Evaluator.modulo_one`, a `ModuloOne`: f can be sampled up to an unknown integer in less time.
+- `Evaluator.patches`, a `Patches`: the surface is the union of many level sets (patches), each of
+  its own function and inside its own box.
+- `Evaluator.variable_accuracy`, a `VariableAccuracy`: f can be sampled with different accuracy.
+
+One more is an attribute of the field:
+
 - `Field.boundary`, a `Boundary`: every level set ends at the same curves or points.
-- `Field.variable_accuracy`, a `VariableAccuracy`: f can be sampled with different accuracy.
 
 Accuracy of sums over trees. The smaller the truncation error of a sum over a tree, the higher its
 cost; and far from the surface a large error does no harm. So `VariableAccuracy.at` takes any
@@ -32,6 +35,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from harnack.enclosures.samples import describe_type
+from harnack.fields.evaluator import Evaluator
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, IntArray, Mask, Real, Vec3
@@ -102,19 +106,20 @@ class PatchEntry:
 
 
 class Jumps(abc.ABC):
-    """The facets, such as triangles, across which the function f of a field jumps. They cut a ray o
-    + t d, with |d| = 1, into intervals. On each interval f is smooth, and can be continued smoothly
-    beyond both ends of the interval; this continuation is what the tracer marches along. A crossing
-    is a point where the ray meets a facet (`JumpCrossing`).
+    """The facets, such as triangles, across which a function f jumps. They cut a ray o + t d, with
+    |d| = 1, into intervals. On each interval f is smooth, and can be continued smoothly beyond both
+    ends of the interval; this continuation is what the tracer marches along. A crossing is a point
+    where the ray meets a facet (`JumpCrossing`).
 
     The promises of a sample (proved bounds of f near a point) are about f continued smoothly
     through all facets. Where a ray crosses a facet, the values just before and just behind it are
     compared with the levels. So the surface consists of the points off the facets at which f takes
     a level, and of the points of facets with a level between the limits of f from both sides. What
-    `Field.evaluate` gives at a point on a facet does not matter for that; it may be either limit.
+    `Evaluator.evaluate` gives at a point on a facet does not matter for that; it may be either
+    limit.
 
     A field with jumps is real-valued (it has no period). Subclasses define two methods:
-    `next_crossing` gives the next crossing of a ray, and `continuation` gives the field on the
+    `next_crossing` gives the next crossing of a ray, and `continuation` gives the evaluator on the
     interval between two crossings. They also define `initial_offset` if `continuation` uses its
     `offset`, unless f has no offset (0) at the start of every ray. `harnack.testing.check_field`
     tests all three.
@@ -124,13 +129,13 @@ class Jumps(abc.ABC):
     """
 
     takes_all_levels: bool = False
-    """Whether the field takes its levels only at its facets: see `are_whole_surface`."""
+    """Whether f takes its levels only at its facets: see `are_whole_surface`."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Wrap the methods `next_crossing` and `continuation` of a new subclass, such that they
         raise a TypeError if they return something of another type than they should."""
         super().__init_subclass__(**kwargs)
-        for name, check in (("next_crossing", _check_crossing), ("continuation", _check_field)):
+        for name, check in (("next_crossing", _check_crossing), ("continuation", _check_evaluator)):
             if name in vars(cls):
                 setattr(cls, name, _with_checked_result(vars(cls)[name], check))
 
@@ -167,25 +172,25 @@ class Jumps(abc.ABC):
     @abc.abstractmethod
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> Field:
-        """A field for the part of a ray o + t d between two consecutive crossings: it gives f
-        there, continued smoothly beyond both ends.
+    ) -> Evaluator:
+        """The evaluator for the part of a ray o + t d between two consecutive crossings: it samples
+        f there, continued smoothly beyond both ends.
 
         behind: the crossing passed last; or the start of the ray, with facet NO_FACET.
         ahead: the next crossing; or t = inf, with facet NO_FACET.
         offset: `initial_offset` at the start of the ray plus all jumps since.
 
-        The field's `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
+        Its `evaluate` is called at points p = o + t d with behind.t <= t <= ahead.t, up to
         rounding. At the two ends it gives the limit from inside the interval, even if rounding puts
-        p on the other side of the facet, or if the two t are equal. A field that consists of such
-        a function and of nothing else is `EvaluateOnly(function)`. Its promises (proved bounds
+        p on the other side of the facet, or if the two t are equal. An evaluator that consists of
+        such a function and of nothing else is `EvaluateOnly(function)`. Its promises (proved bounds
         near p) are about the continued function. The tracer uses them only between the two
         crossings.
         """
 
     def distance(self, p: Vec3) -> Real:
         """The distance from p to the nearest facet, rounded down. Lower bounds of distances use it;
-        for fields that do not define it they are refused."""
+        for classes that do not define it they are refused."""
         raise NotImplementedError(
             f"{type(self).__name__} gives no distances to facets: define its method distance(p)"
         )
@@ -229,8 +234,8 @@ class Jumps(abc.ABC):
 
     def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the level set of these levels consists of all facets and of nothing else. Then
-        `Field.with_levels` returns a field that takes the levels at every facet and nowhere else
-        (`takes_all_levels`). The default is False."""
+        the evaluator that `Field.evaluator` returns for a plan with these levels takes them at
+        every facet and nowhere else (`takes_all_levels`). The default is False."""
         del levels
         return False
 
@@ -259,14 +264,22 @@ def _check_crossing(name: str, result: Any) -> None:
         )
 
 
-def _check_field(name: str, result: Any) -> None:
-    """Raise TypeError unless the result of `Jumps.continuation` is a field."""
-    # (What makes a field here are its samples: `fields.field` imports this file.)
-    if not callable(getattr(result, "sample_ray", None)):
+def _check_evaluator(name: str, result: Any) -> None:
+    """Raise TypeError unless the result of `Jumps.continuation` is an evaluator."""
+    if isinstance(result, Evaluator):
+        return
+    # A field is what has the method `evaluator`: `fields.field` imports this file.
+    if callable(getattr(result, "evaluator", None)):
         raise TypeError(
-            f"{name} returned {describe_type(result)}: return a field, a harnack.Field whose "
-            "evaluate(p) gives f between the two crossings"
+            f"{name} returned {describe_type(result)}, a field, which describes f: return what "
+            "samples f, harnack.fields.EvaluateOnly(field.evaluate), or an evaluator that was made "
+            "before by field.evaluator(backend)"
         )
+    raise TypeError(
+        f"{name} returned {describe_type(result)}: return a harnack.fields.Evaluator whose "
+        "evaluate(p) gives f between the two crossings, such as "
+        "harnack.fields.EvaluateOnly(function)"
+    )
 
 
 class ModuloOne(abc.ABC):
@@ -288,11 +301,11 @@ class ModuloOne(abc.ABC):
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
         """A sample at p whose value is f minus an unknown integer, which may differ from point to
-        point. So it may take less time than `Field.evaluate`."""
+        point. So it may take less time than `Evaluator.evaluate`."""
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
-        """f at p, on active lanes on which it takes less time than `Field.evaluate`. The result is
-        NaN on all other lanes, and where p may lie on a facet. The default is NaN everywhere.
+        """f at p, on active lanes on which it takes less time than `Evaluator.evaluate`. The result
+        is NaN on all other lanes, and where p may lie on a facet. The default is NaN everywhere.
 
         rounding: a bound of the rounding errors of the coordinates of p, and of the ray on which p
             lies.
@@ -312,8 +325,8 @@ class Patches(abc.ABC):
     than the first hit so far.
 
     The patches share the period, the levels and the domain of the field, whose own `evaluate` has
-    no meaning. `Field.with_levels` is called first. The methods may be called while a loop is being
-    recorded.
+    no meaning. They are those of the levels of the evaluator's plan (`Plan.levels`). The methods
+    may be called while a loop is being recorded.
     """
 
     @abc.abstractmethod
@@ -330,8 +343,9 @@ class Patches(abc.ABC):
         """
 
     @abc.abstractmethod
-    def patch(self, index: Any) -> Field:
-        """The field that has the patch with this index as one of its level sets.
+    def patch(self, index: Any) -> Evaluator:
+        """The evaluator of the function that has the patch with this index as one of its level
+        sets.
 
         index: a Dr.Jit UInt32, which may differ from lane to lane.
 
@@ -370,36 +384,37 @@ EXACT = 1e9
 
 @dataclass(frozen=True)
 class VariableAccuracy:
-    """How a field can be sampled with different accuracy. An example is a sum over a tree of
-    sources, which treats a far cluster of sources as a single source. The farther a cluster must be
-    for that, the smaller is the truncation error and the higher the cost. The tracer starts with
-    coarse samples and refines them where the truncation error shortens steps.
+    """How f can be sampled with different accuracy. An example is a sum over a tree of sources,
+    which treats a far cluster of sources as a single source. The farther a cluster must be for
+    that, the smaller is the truncation error and the higher the cost. The tracer starts with coarse
+    samples and refines them where the truncation error shortens steps.
 
     An accuracy scale is a number, which may differ from lane to lane. Larger is more accurate: 0
-    gives the coarsest samples of the field, 1 the samples of `Field.evaluate`, and a number above 1
+    gives the coarsest samples of f, 1 the samples of `Evaluator.evaluate`, and a number above 1
     more accurate samples.
 
-    at: a function that takes an accuracy scale and returns the field, sampled with it; in the
-        simplest case an `EvaluateOnly`. `Sample.truncation_error` falls with the scale, and is 0 if
-        the scale is large enough (`EXACT`). How fast it falls matters for the time
-        only: the scales that the tracer tries suit about the third power, and steps are proved for
-        any. The largest that it tries is 10^6, where the truncation error should be 0. A coarse
-        sample is as valid as any other; its `value_error` is larger.
+    at: a function that takes an accuracy scale and returns the evaluator with it; in the simplest
+        case an `EvaluateOnly`. `Sample.truncation_error` falls with the scale, and is 0 if the
+        scale is large enough (`EXACT`). How fast it falls matters for the time only: the scales
+        that the tracer tries suit about the third power, and steps are proved for any. The
+        largest that it tries is 10^6, where the truncation error should be 0. A coarse sample is as
+        valid as any other; its `value_error` is larger.
     coarsest: the accuracy scale of the coarsest samples, in (0, 1]. A smaller scale, such as 0,
         gives no coarser samples, but for the next attribute.
     may_lack_integer: whether samples with a scale below `coarsest` may give f only modulo 1. Those
         samples set `Sample.branch_unknown`.
     """
 
-    at: Callable[[Real], Field]
+    at: Callable[[Real], Evaluator]
     coarsest: float = 1.0
     may_lack_integer: bool = False
 
 
-def exactly_sampled(field: Field, backend: Backend) -> Field:
-    """The field, sampled without truncation error; the field itself if it has a single accuracy.
+def exactly_sampled(evaluator: Evaluator, backend: Backend) -> Evaluator:
+    """The evaluator of the same function without truncation error; the evaluator itself if it has a
+    single accuracy.
 
-    field: a field that is prepared for the backend.
+    backend: that of the evaluator.
     """
-    accuracy = field.variable_accuracy
-    return field if accuracy is None else accuracy.at(backend.Float(EXACT))
+    accuracy = evaluator.variable_accuracy
+    return evaluator if accuracy is None else accuracy.at(backend.Float(EXACT))

@@ -6,9 +6,11 @@ triangles do not cancel. *Promises* are proved bounds of w near a point. In unit
 mesh has a size of about one. A sample's *accuracy scale* is a number: larger is more accurate. In
 an *FMM cell* (fast multipole method) near edges or triangles are summed directly, and all others
 are replaced by one polynomial. A *lane* is one entry of Dr.Jit's arrays, such as a point or a ray;
-a *backend* is what Dr.Jit computes on, and in which precision.
+a *backend* is what Dr.Jit computes on, and in which precision; an *evaluator* samples a field on a
+backend.
 
 - `WindingNumber`: the field.
+- `WindingModuloOne`: the field w modulo 1.
 - `winding_extent`, `winding_cells`: the volume and the cells that are proved to contain its level
   sets, on its triangles and on the surfaces that span its holes.
 
@@ -22,7 +24,7 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import drjit as dr
 import numpy as np
@@ -33,7 +35,7 @@ from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_integer_in_range, as_real, no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import BatchedField
+from harnack.fields.batched_fields import BatchedField, cached_upload
 from harnack.fields.capabilities import (
     NO_FACET,
     JumpCrossing,
@@ -43,7 +45,8 @@ from harnack.fields.capabilities import (
     VariableAccuracy,
 )
 from harnack.fields.clearance import DeviceField, occupied_cells, tight_extent
-from harnack.fields.field import EvaluateOnly, Field, Sample, space_scaled
+from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
+from harnack.fields.field import Field, Sample, space_scaled
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import BuiltCells, FieldWithCells
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
@@ -63,9 +66,6 @@ from harnack.tree.closest_triangles import (
 from harnack.tree.triangle_tree import RayFrame, TriangleTree
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from typing import Self
-
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
@@ -80,60 +80,25 @@ _MAX_HALVINGS = 6
 _CELLS_ACROSS = 192
 
 
-class ModuloOneEvaluable(Protocol):
-    """An object that evaluates a winding number w modulo 1 (w minus an unknown integer), as
-    `WindingNumber` does: the methods that proofs about its level sets use."""
-
-    def prepare(self, backend: Backend) -> ModuloOneEvaluable:
-        """A copy with its data on a backend, for tracing."""
-        ...
-
-    def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer at points p: value, gradient, errors and proved
-        bounds of w near p. detail: the accuracy scale; larger is more accurate, 0 is the coarsest.
-        """
-        ...
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that is proved to contain the level sets of w; None if there is no bounded
-        one."""
-        ...
-
-
 class WindingModuloOne(Field):
     """The winding number w of a mesh modulo 1, as a field with period 1. It is continuous off the
     singular edges, also across the triangles. Where w takes a level off its triangles, this field
     takes it, too; the converse does not hold.
-
-    winding: the object that evaluates w. The proved bounds in its samples hold for a function that
-        differs from w by integers: the smooth continuation of w through all triangles.
 
     Samples are the coarsest ones by default, which take half the time of ordinary ones. Ordinary
     samples would prove only 2 % more cells empty.
     """
 
     period: ClassVar[float | None] = 1.0
+    has_variable_accuracy = True
 
-    def __init__(self, winding: ModuloOneEvaluable) -> None:
-        """winding: the object that evaluates w."""
+    def __init__(self, winding: WindingNumber) -> None:
+        """winding: the winding number w."""
         self._winding = winding
 
-    def prepare(self, backend: Backend) -> Self:
-        """A copy with its data on a backend, for tracing."""
-        prepared = copy.copy(self)
-        prepared._winding = self._winding.prepare(backend)
-        return prepared
-
-    def evaluate(self, p: Vec3) -> Sample:
-        """A coarsest sample of w minus an unknown integer at points p."""
-        return self._winding.evaluate_modulo_one(p)
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the field is sampled with another accuracy; never None here."""
-        return VariableAccuracy(
-            lambda scale: EvaluateOnly(lambda p: self._winding.evaluate_modulo_one(p, scale))
-        )
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The object that samples w modulo 1 on a backend. plan: what it will be used for."""
+        return _ModuloOneEvaluator(self._winding.traced_data(backend, plan.ray_count))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of w; None if there is no bounded
@@ -141,8 +106,29 @@ class WindingModuloOne(Field):
         return self._winding.extent(levels)
 
 
+class _ModuloOneEvaluator(Evaluator):
+    """The winding number w of a mesh modulo 1, sampled on a backend. The proved bounds in its
+    samples hold for a function that differs from w by integers: the smooth continuation of w
+    through all triangles.
+
+    data: the mesh on the backend.
+    """
+
+    def __init__(self, data: _WindingData) -> None:
+        """data: the mesh on the backend."""
+        self._data = data
+        # How w modulo 1 is sampled with another accuracy.
+        self.variable_accuracy = VariableAccuracy(
+            lambda scale: EvaluateOnly(lambda p: data.sample_modulo_one(p, scale))
+        )
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """A coarsest sample of w minus an unknown integer at points p."""
+        return self._data.sample_modulo_one(p)
+
+
 def winding_cells(
-    winding: ModuloOneEvaluable, extent: Volume, levels: tuple[float, ...]
+    winding: WindingNumber, extent: Volume, levels: tuple[float, ...]
 ) -> OccupancyGrid:
     """A grid of cells over the volume `extent`, each marked as occupied or empty. A cell is empty
     if the winding number w modulo 1 is proved to take none of the levels in it; triangles do not
@@ -150,14 +136,12 @@ def winding_cells(
     return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
 
 
-def winding_extent(
-    winding: ModuloOneEvaluable, mesh: WindingMesh, levels: tuple[float, ...]
-) -> Volume | None:
+def winding_extent(winding: WindingNumber, levels: tuple[float, ...]) -> Volume | None:
     """A polytope that is proved to contain the level sets of the winding number w of a mesh. For a
     closed mesh it is a box. There always is one; None occurs only in the type of the result, which
     is that of `Field.extent`.
 
-    winding: an object that evaluates w of the mesh modulo 1.
+    winding: the winding number.
     levels: the values of w whose level sets are meant.
 
     Proof. A point of a level set lies on a triangle, where w jumps over the level; or it lies off
@@ -165,6 +149,7 @@ def winding_extent(
     triangles. It also contains all cells of `winding_box` in which w modulo 1, which does not jump
     at triangles, is not proved to be off the level.
     """
+    mesh = winding.mesh
     box = winding_box(mesh, levels)
     # A closed mesh has its level sets on its triangles, and these lie in the box.
     if not len(mesh.singular_edges):
@@ -264,7 +249,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         proved remainder (`boundary_cells`). So a sample takes the same time whatever the number of
         edges. In a soup, where triangles have hardly an edge in common, near triangles take the
         place of edges if the method is "tree" (`dipole_cells`). None builds cells if they save time
-        (`for_ray_count`), True always, False never. They take at most the number of megabytes of
+        (`Plan.ray_count`), True always, False never. They take at most the number of megabytes of
         this argument (True: 256), and several times as much while they are built. If the user
         requested the cells of a soup, they also give values and gradients at points, which saves
         time for more than some 2,000 points per triangle. All other values and derivatives at
@@ -286,6 +271,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
     period: ClassVar[float | None] = None
     default_level: float = 0.5
     is_larger_inside = True
+    has_jumps = True
 
     def __init__(
         self,
@@ -325,8 +311,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
         self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
         self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
-        # The level that the field takes at all triangles and nowhere else; None for other fields.
-        self._level_of_sheets: float | None = None
         self._rates: TransientCache[Backend, BoundaryRates] = TransientCache()
 
     @no_derivatives
@@ -344,9 +328,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         field = copy.copy(self)
         field._mesh = self.mesh.with_vertices(vertices)
         # What was computed from the old positions is dropped.
-        field._batches, field._device, field._rates = TransientCache(), None, TransientCache()
+        field._rates, field._own_levels = TransientCache(), TransientCache()
         field._extents, field._occupied = TransientCache(), TransientCache()
-        field._own_levels = TransientCache()
         field.configure_cells(self.cells)
         return field
 
@@ -381,7 +364,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
         closer: the accuracy scale, for a tree; larger is more accurate.
         """
-        data = self._batch_data(backend_of(x))
+        data = self._upload(backend_of(x), traced=False)
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
@@ -402,7 +385,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
         accuracy. The error of a gradient is then about 1 % of the gradient's length in most places,
         or far less."""
-        data = self._batch_data(backend_of(x))
+        data = self._upload(backend_of(x), traced=False)
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
             return self.values_at(x, 1)  # 1: with gradients
@@ -452,6 +435,24 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             data.size
         )
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The object that samples w on a backend. If the surface of the plan's levels is the mesh
+        itself (`is_whole_surface`), it takes the level only at the triangles.
+
+        plan: what the evaluator will be used for. For many rays it has FMM cells.
+        """
+        if self.is_whole_surface(plan.levels):
+            field, level_of_sheets = self.with_cells(False), plan.levels[0]
+        else:
+            field, level_of_sheets = self.for_ray_count(plan.ray_count), None
+        return _WindingEvaluator(field, field.traced_data(backend), level_of_sheets)
+
+    def traced_data(self, backend: Backend, ray_count: int = 0) -> _WindingData:
+        """The mesh on a backend, for tracing; with FMM cells if they save time for this number of
+        rays."""
+        return self.for_ray_count(ray_count)._upload(backend, traced=True)
+
+    @cached_upload
     def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
         """Copy the mesh to a backend, in unit coordinates.
 
@@ -514,18 +515,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             return value, np.full(len(value), _EXACT_ERROR)
         return value, field.error_bound(points, precision="double")
 
-    @property
-    def jumps(self) -> Jumps | None:
-        """The triangles, across which w jumps; never None here."""
-        return _TriangleJumps(self, self._data_for, self._level_of_sheets)
-
-    @property
-    def modulo_one(self) -> ModuloOne | None:
-        """How w is sampled up to an unknown integer: by FMM cells of edges. None unless the field
-        was prepared with them."""
-        data = self._device
-        return None if data is None or data.cells is None else _CellSamples(self, data)
-
     def cells_pay_from(self) -> float:
         """The smallest number of rays for which FMM cells save more time than it takes to build
         them; infinite if they never do. A soup (`_is_soup`) has cells of triangles, another mesh
@@ -550,37 +539,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             return None
         return self._occupied.get_or_make(levels, lambda: winding_cells(self, extent, levels))
 
-    def evaluate(self, p: Vec3) -> Sample:
-        """A sample of w itself at points p, jumps included: value, gradient, errors and proved
-        bounds near p. The bounds hold for the smooth continuation of w through all triangles."""
-        data, frame = self._upward_rays(p)
-        return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
-
-    def evaluate_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
-        """A sample of w minus an unknown integer at points p. The integer may differ from point to
-        point.
-
-        detail: the accuracy scale; larger is more accurate. At 0, the default, the sample comes
-            from an FMM cell where there is one.
-        """
-        data, frame = self._upward_rays(p)
-        detail = data.backend.Float(detail)
-        if data.cells is None:
-            return _sample_at_start(data, frame, data.backend.Float(0), detail)
-        # None: no direction of a ray. The last argument is the mask of the lanes to compute.
-        from_cells, is_in_cell = data.cells.sample(
-            frame.o, None, coordinate_rounding(frame.o), detail <= 0
-        )
-        # The number of crossings ahead is an integer, so that 0 may stand for it.
-        from_all = _sample_at_start(data, frame, data.backend.Float(0), detail, ~is_in_cell)
-        return from_all.select(is_in_cell, space_scaled(from_cells, data.size))
-
-    def _upward_rays(self, p: Vec3) -> tuple[_WindingData, RayFrame]:
-        """The mesh on the device; and rays from the points p along z, in unit coordinates. With an
-        exact method their crossings with triangles give the integer part of w."""
-        data = self._data_for(p)
-        return data, RayFrame.along(data.backend, data.to_unit(p), data.backend.Array3f(0, 0, 1))
-
     def is_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the surface of these levels is the mesh itself, all triangles and nothing else,
         because the mesh lies on its own level set (`own_sheet`). It is computed once. It is False
@@ -588,15 +546,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         if len(levels) != 1:
             return False
         return self._own_levels.get_or_make(levels, lambda: lies_on_own_level(self.mesh, levels[0]))
-
-    def with_levels(self, levels: tuple[float, ...]) -> WindingNumber:
-        """The field by which these levels are traced. If the surface is the mesh itself
-        (`is_whole_surface`), this is a copy that has the level only at its triangles."""
-        if not self.is_whole_surface(levels):
-            return self
-        field = self.with_cells(False)
-        field._level_of_sheets = levels[0]
-        return field
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for level 0, the value of w outside a closed mesh, which is no
@@ -610,7 +559,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         them that are not proved empty (`winding_extent`). It is computed once for these levels, and
         is never None."""
         return self._extents.get_or_make(
-            levels, lambda: winding_extent(self.with_cells(False), self.mesh, levels)
+            levels, lambda: winding_extent(self.with_cells(False), levels)
         )
 
     def describe(self) -> dict[str, Any]:
@@ -626,26 +575,57 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         }
 
 
+class _WindingEvaluator(Evaluator):
+    """The winding number w of a mesh, sampled on a backend.
+
+    jumps: the triangles, across which w jumps.
+    modulo_one: how w is sampled up to an unknown integer, by FMM cells of edges; None if there are
+        none.
+    """
+
+    def __init__(
+        self, field: WindingNumber, data: _WindingData, level_of_sheets: float | None
+    ) -> None:
+        """field: the winding number. data: the mesh on the backend. level_of_sheets: the level that
+        w takes at the triangles and nowhere else, if the mesh is the whole surface of this level
+        (`own_sheet`); otherwise None."""
+        self._field, self._data = field, data
+        self.jumps = _TriangleJumps(field, data, level_of_sheets)
+        self.modulo_one = None if data.cells is None else _CellSamples(data)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """A sample of w itself at points p, jumps included: value, gradient, errors and proved
+        bounds near p. The bounds hold for the smooth continuation of w through all triangles."""
+        data = self._data
+        frame = data.upward_rays(p)
+        return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return self._field.hessian(p)
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        return self._field.derivative_errors(p, sample)
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        return self._field.differentiable_value(p)
+
+
 # Capabilities of a winding number as objects (`fields.capabilities`).
 
 
 class _TriangleJumps(Jumps):
-    """The triangles of a mesh, across which its winding number w jumps by an integer. `data_for`
-    returns the mesh on the device of points p, in unit coordinates.
+    """The triangles of a mesh, across which its winding number w jumps by an integer.
 
     field: the winding number.
-    data_for: a function that returns the mesh on the device of points p.
-    level: if the mesh is the whole surface (`WindingNumber.with_levels`), the level that the field
-        takes at the triangles and nowhere else; otherwise None.
+    data: the mesh on a backend, in unit coordinates.
+    level: if the mesh is the whole surface (`own_sheet`), the level that w takes at the triangles
+        and nowhere else; otherwise None.
     """
 
-    def __init__(
-        self, field: WindingNumber, data_for: Callable[[Vec3], _WindingData], level: float | None
-    ) -> None:
-        """field: the winding number. data_for: a function that returns the mesh on the device of
-        points p. level: the level that the field takes at the triangles and nowhere else, if the
-        mesh is the whole surface; otherwise None."""
-        self.field, self.data_for, self.level = field, data_for, level
+    def __init__(self, field: WindingNumber, data: _WindingData, level: float | None) -> None:
+        """field: the winding number. data: the mesh on a backend. level: the level that w takes at
+        the triangles and nowhere else, if the mesh is the whole surface; otherwise None."""
+        self.field, self.data, self.level = field, data, level
         self.takes_all_levels = level is not None
 
     def next_crossing(
@@ -654,7 +634,7 @@ class _TriangleJumps(Jumps):
         """The next crossing of each ray o + t d with a triangle, after the crossing `after` and up
         to t = t_max, with the jump of w there along the ray. active: the mask of the lanes to
         compute."""
-        data = self.data_for(o)
+        data = self.data
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
         behind = (after.t / data.size, after.facet)
         t, facet, sign, normal = data.rays.next_crossing(frame, behind, t_max / data.size, active)
@@ -665,7 +645,7 @@ class _TriangleJumps(Jumps):
         """The signed number of triangles that each ray o + t d crosses beyond t_min: the number
         from which the exact method follows w along the ray. It is 0 for the tree, which needs no
         such number, and if the surface is the mesh itself."""
-        data = self.data_for(o)
+        data = self.data
         if self.takes_all_levels:
             return data.backend.Float(0)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
@@ -673,11 +653,11 @@ class _TriangleJumps(Jumps):
 
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> Field:
+    ) -> Evaluator:
         """The winding number w on each ray o + t d between the crossings `behind` and `ahead` with
-        triangles, as a field without jumps. offset: the signed number of all crossings beyond
+        triangles, as an evaluator without jumps. offset: the signed number of all crossings beyond
         `behind` on the ray."""
-        data = self.data_for(o)
+        data = self.data
         if self.level is not None:
             return _BesideSheets(data.backend, self.level, behind, ahead)
         frame = RayFrame.along(data.backend, data.to_unit(o), d)
@@ -686,7 +666,7 @@ class _TriangleJumps(Jumps):
 
     def distance(self, p: Vec3) -> Real:
         """A lower bound of the distance from p to the triangles, at which w jumps."""
-        data = self.data_for(p)
+        data = self.data
         return distance_lower_bound(data.rays, data.to_unit(p)) * data.size
 
     def nearest_facet(
@@ -697,7 +677,7 @@ class _TriangleJumps(Jumps):
 
         after: the squared distance and the index of the previous triangle.
         """
-        data = self.data_for(p)
+        data = self.data
         # data.rays is the tree of triangles.
         facet = next_closest_triangle(
             data.rays, data.to_unit(p), after, dr.square(limit / data.size), active
@@ -732,14 +712,12 @@ class _TriangleJumps(Jumps):
 class _CellSamples(ModuloOne):
     """Samples of a winding number w from FMM cells, up to an unknown integer.
 
-    field: the winding number, prepared with FMM cells of edges.
-    data: the mesh and its cells on the backend.
+    data: the mesh and its FMM cells of edges on a backend.
     """
 
-    def __init__(self, field: WindingNumber, data: _WindingData) -> None:
-        """field: the winding number, prepared with FMM cells of edges. data: the mesh and its cells
-        on the backend."""
-        self.field, self.data = field, data
+    def __init__(self, data: _WindingData) -> None:
+        """data: the mesh and its FMM cells of edges on a backend."""
+        self.data = data
 
     @property
     def sure_accuracy(self) -> float:
@@ -748,7 +726,7 @@ class _CellSamples(ModuloOne):
 
     def evaluate(self, p: Vec3) -> Sample:
         """A coarsest sample of w minus an unknown integer at points p."""
-        return self.field.evaluate_modulo_one(p)
+        return self.data.sample_modulo_one(p)
 
     def value_if_cheap(self, p: Vec3, rounding: Real, active: Mask) -> Real:
         """w at points p, with its integer, on active lanes on which the FMM cell that contains p
@@ -783,6 +761,29 @@ class _WindingData(UnitFrame):
             return self.winding.cells
         return self.cells
 
+    def upward_rays(self, p: Vec3) -> RayFrame:
+        """Rays from the points p along z, in unit coordinates. With an exact method their crossings
+        with triangles give the integer part of w."""
+        return RayFrame.along(self.backend, self.to_unit(p), self.backend.Array3f(0, 0, 1))
+
+    def sample_modulo_one(self, p: Vec3, detail: Real = 0.0) -> Sample:
+        """A sample of w minus an unknown integer at points p: value, gradient, errors and proved
+        bounds of w near p. The integer may differ from point to point.
+
+        detail: the accuracy scale; larger is more accurate. At 0, the default, the sample comes
+            from an FMM cell of edges where there is one.
+        """
+        frame, detail = self.upward_rays(p), self.backend.Float(detail)
+        if self.cells is None:
+            return _sample_at_start(self, frame, self.backend.Float(0), detail)
+        # None: no direction of a ray. The last argument is the mask of the lanes to compute.
+        from_cells, is_in_cell = self.cells.sample(
+            frame.o, None, coordinate_rounding(frame.o), detail <= 0
+        )
+        # The number of crossings ahead is an integer, so that 0 may stand for it.
+        from_all = _sample_at_start(self, frame, self.backend.Float(0), detail, ~is_in_cell)
+        return from_all.select(is_in_cell, space_scaled(from_cells, self.size))
+
 
 def _sample_at_start(
     data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
@@ -803,7 +804,7 @@ def _sample_at_start(
     return space_scaled(dataclasses.replace(sample, ray_promises=()), data.size)
 
 
-class _WindingOnInterval(Field):
+class _WindingOnInterval(Evaluator):
     """The winding number w of a mesh on an interval of each ray, between two crossings of
     triangles, continued smoothly to both ends. A crossing is a point at which the ray passes
     through a triangle.
@@ -840,7 +841,7 @@ class _WindingOnInterval(Field):
             return None
         return VariableAccuracy(self._at_accuracy, winding.coarsest_detail, has_cells)
 
-    def _at_accuracy(self, detail: Real) -> Field:
+    def _at_accuracy(self, detail: Real) -> Evaluator:
         """The same function with samples of the accuracy scale `detail`."""
         return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
 
@@ -867,10 +868,10 @@ class _WindingOnInterval(Field):
         return space_scaled(sample, data.size)
 
 
-class _BesideSheets(Field):
-    """The field on an interval of each ray between two crossings of a mesh that lies on its own
-    level set (`own_sheet`), so that its triangles are the whole surface. On the interval the field
-    is constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the triangle
+class _BesideSheets(Evaluator):
+    """The function on an interval of each ray between two crossings of a mesh that lies on its own
+    level set (`own_sheet`), so that its triangles are the whole surface. On the interval it is
+    constant: the level plus 1/2 or minus 1/2. The sign is such that the jump at the triangle
     ahead passes the level. If no triangle is ahead, the jump at the triangle behind decides.
 
     level: the level of the surface.
@@ -883,8 +884,8 @@ class _BesideSheets(Field):
         """backend: that of the crossings. level: the level of the surface. behind, ahead: the
         crossings at the ends of the interval."""
         real = backend.Float
-        # A positive jump ahead leads up through the level, so that the field is below it before.
-        # After a positive jump behind the field is above it. A jump of 0 means that there is no
+        # A positive jump ahead leads up through the level, so that the function is below it before.
+        # After a positive jump behind the function is above it. A jump of 0 means that there is no
         # triangle.
         jump = dr.select(real(ahead.jump) != 0, -real(ahead.jump), real(behind.jump))
         self._value = dr.select(jump > 0, real(level + 0.5), level - 0.5)
