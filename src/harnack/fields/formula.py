@@ -590,8 +590,10 @@ def on_backend(value: Any, backend: Backend) -> Any:
     if isinstance(value, tuple):
         entries = cast("tuple[Any, ...]", value)
         return tuple(on_backend(entry, backend) for entry in entries)
+    if isinstance(value, Formula) and type(value).formula_on is Formula.formula_on:
+        return with_device_numbers(value, backend)
     if isinstance(value, Field) and hasattr(value, "formula_on"):
-        other = with_device_numbers(value, backend)
+        other = copy.copy(value)
         object.__setattr__(other, "formula", cast("Any", value).formula_on(backend))
         return other
     return value
