@@ -117,7 +117,7 @@ class PatchField(Field):
         """The evaluator of the patches, with boxes that contain them for the levels of the plan; or
         for the default level, if it has none."""
         patches = self._upload(backend, plan.levels or (self.default_level,))
-        return _PatchEvaluator(patches, self.no_single_function)
+        return _PatchFieldEvaluator(patches, self.no_single_function)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A box that contains the patches of these levels: the box around the boxes of all patches.
@@ -126,7 +126,7 @@ class PatchField(Field):
         return Box(lower.min(axis=0), upper.max(axis=0))
 
 
-class _PatchEvaluator(Evaluator):
+class _PatchFieldEvaluator(Evaluator):
     """The evaluator of a `PatchField`, which has patches and nothing else."""
 
     def __init__(self, patches: PatchesInBoxes, no_single_function: str) -> None:

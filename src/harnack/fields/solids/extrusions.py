@@ -305,7 +305,7 @@ class _ExtrusionEvaluator(Evaluator):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives)."""
-        if not is_jet(x, Extrusion.__name__):
+        if not is_jet(x, self.name):
             return self.differentiable_value(_vector(x, y, z))
         u, v, w = self._preimage(x, y, z)
         half = self.data.half
@@ -637,9 +637,9 @@ class SolidOfRevolution(Solid):
         half = 0.5 * (upper - lower) + level
         return box_around((radius, radius, half), (0.0, 0.0, 0.5 * (lower + upper)))
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _RevolutionEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SolidOfRevolutionEvaluator:
         del plan
-        return _RevolutionEvaluator(self._upload(backend))
+        return _SolidOfRevolutionEvaluator(self._upload(backend))
 
     @cached_upload
     def _upload(self, backend: Backend) -> OutlineEdges:
@@ -654,7 +654,7 @@ class SolidOfRevolution(Solid):
 
 
 @dataclass(frozen=True, eq=False)
-class _RevolutionEvaluator(Evaluator):
+class _SolidOfRevolutionEvaluator(Evaluator):
     """The evaluator of a `SolidOfRevolution`.
 
     outline: the edges of the outline.
@@ -734,7 +734,7 @@ class _RevolutionEvaluator(Evaluator):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives)."""
-        if not is_jet(x, SolidOfRevolution.__name__):
+        if not is_jet(x, self.name):
             return self.differentiable_value(_vector(x, y, z))
         return outline_distance_jet(self.outline.sample, norm(x, y), z)
 

@@ -205,9 +205,9 @@ class MeshSolid(Solid):
         x, y, z = (float(coordinate) for coordinate in half)
         return box_around((x, y, z), tuple(float(coordinate) for coordinate in center))
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _MeshEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _MeshSolidEvaluator:
         del plan
-        return _MeshEvaluator(self._upload(backend))
+        return _MeshSolidEvaluator(self._upload(backend))
 
     @cached_upload
     def _upload(self, backend: Backend) -> _MeshData:
@@ -223,7 +223,7 @@ class MeshSolid(Solid):
 
 
 @dataclass(frozen=True, eq=False)
-class _MeshEvaluator(Evaluator):
+class _MeshSolidEvaluator(Evaluator):
     """The evaluator of a `MeshSolid`.
 
     data: the triangles on a backend.
@@ -267,7 +267,7 @@ class _MeshEvaluator(Evaluator):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives)."""
-        if not is_jet(x, MeshSolid.__name__):
+        if not is_jet(x, self.name):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
         return mesh_distance_jet(self.data, x, y, z)
 
