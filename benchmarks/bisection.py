@@ -29,7 +29,7 @@ def bisect(
         free is a hit.
     """
     o, d, end = rays
-    prepared = field.prepare(backend)
+    prepared = field.evaluator(backend)
     levels = Levels((dr.opaque(backend.Float, 0.0),))
     real, count = backend.Float, backend.UInt32
 

@@ -94,7 +94,7 @@ def _clip(field: hk.SolidAngle, eye: np.ndarray, d: np.ndarray) -> tuple[np.ndar
     assert volume is not None
     rays = to_vector3(backend, eye[None]), to_vector3(backend, d)
     interval = to_float(backend, 0.0), to_float(backend, 10.0)
-    near, far = volume.prepare(backend).clip(*rays, *interval)
+    near, far = volume.upload(backend).clip(*rays, *interval)
     return to_numpy(near), to_numpy(far)
 
 

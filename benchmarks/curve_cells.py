@@ -96,7 +96,7 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
     for _ in range(2):  # the first time compiles kernels
         field = make(cells=2000)
         field.extent((field.default_level,))
-        built = _seconds(lambda field=field: field.prepare(backend))
+        built = _seconds(lambda field=field: field.evaluator(backend))
     entries: list[str] = []
     for o, d in (_camera(count.width), _chords(count.count), _bounces(plain, count)):
         rays = to_vector3(backend, o), to_vector3(backend, d)
@@ -105,7 +105,7 @@ def _row(name: str, make: Callable[..., Any], count: _Rays, unit: float = 1e9) -
             work()
             best = min(_seconds(work) for _ in range(count.repeats))
             entries.append(f"{best / len(o) * unit:,.{0 if unit > 1e6 else 1}f}")
-    device_data = field.prepare(backend)._device
+    device_data = field.evaluator(backend)._device
     size = (device_data.built if isinstance(field, hk.WindingNumber) else device_data.cells).size
     return f"| {name} | " + " | ".join(entries) + f" | {built:.2f} s | {size / 1e6:.1f} |"
 

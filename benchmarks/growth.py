@@ -106,7 +106,7 @@ def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
     backend = choose_backend()
     eye, directions = camera(WIDTH)
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
-    prepared = field.prepare(backend)
+    prepared = field.evaluator(backend)
     hits: list[hk.Hits] = []
 
     def call() -> None:

@@ -55,7 +55,7 @@ def measure() -> dict[str, list[float]]:
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
     rows: dict[str, list[float]] = {}
     for name, field in fields().items():
-        prepared = field.prepare(backend)
+        prepared = field.evaluator(backend)
         hits = hk.trace(prepared, o, d, t_max=10.0, tolerance=1e-4)  # compiles
         seconds: list[float] = []
         for _ in range(REPEATS):

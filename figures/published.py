@@ -88,7 +88,7 @@ def claimed_angle(field: hk.SolidAngle) -> Claim:
     """The solid angle of one loop as the paper claims it: more than -4 pi, up to the loop."""
     assert field.lift_bound == "range"
     backend = choose_backend("double")
-    ready = field.prepare(backend)
+    ready = field.evaluator(backend)
 
     def look(p: Array) -> tuple[Array, Array, Array]:
         sample = ready.evaluate(to_vector3(backend, p))

@@ -297,7 +297,7 @@ def test_solids_made_of_sums_over_trees_know_their_curvature() -> None:
         computed = hk.curvature(field, at)
         assert (np.abs(computed.mean - exact) <= computed.mean_error + 1e-3 * np.abs(exact)).all()
         assert np.median(computed.mean_error / np.abs(exact)) < 1e-3
-    coarse = inside.prepare(choose_backend("double"))
+    coarse = inside.evaluator(choose_backend("double"))
     p = to_vector3(choose_backend("double"), at)
     assert (to_numpy(coarse.derivative_errors(p, coarse.evaluate(p))[1]) > 0).all()
 

@@ -157,8 +157,8 @@ class PlaneJumps(hk.fields.Jumps):
         at = o.x + t_min * d.x
         return dr.select((at > 0) | ((at == 0) & (d.x > 0)), 1.0, 0.0)
 
-    def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Step:
-        return Step(offset)
+    def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
+        return hk.fields.EvaluateOnly(Step(offset).evaluate)
 
     def distance(self, p: Any) -> Any:
         return dr.abs(p.x)
@@ -181,9 +181,10 @@ class Step(hk.Field):
         known = (hk.proofs.Lipschitz(0.3),)
         return hk.fields.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
 
-    @property
-    def jumps(self) -> PlaneJumps:
-        return PlaneJumps()
+    has_jumps = True
+
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
+        return hk.fields.SampleEvaluator(self, backend, jumps=PlaneJumps())
 
     @staticmethod
     def distance(x: np.ndarray) -> np.ndarray:
@@ -835,9 +836,10 @@ def test_a_field_must_say_how_far_its_sheets_are() -> None:
         distance = hk.fields.Jumps.distance
 
     class Silent(Step):
-        @property
-        def jumps(self) -> PlaneJumps:
-            return Quiet()
+        has_jumps = True
+
+        def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
+            return hk.fields.SampleEvaluator(self, backend, jumps=Quiet())
 
     with pytest.raises(NotImplementedError, match=r"Silent has jumps.*distance\(p\) of its Quiet"):
         signed_distance(Silent(), [[1.0, 0.0, 0.0]], method="lower_bound")

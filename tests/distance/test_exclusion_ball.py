@@ -68,7 +68,7 @@ def test_third_derivatives_of_waves() -> None:
 def test_no_sample_in_the_ball_is_nearer(name: str) -> None:
     field: Any = CURVED[name]
     on = surface_points(field, 4000)
-    prepared = field.prepare(DOUBLE)
+    prepared = field.evaluator(DOUBLE)
     rng = np.random.default_rng(1)
     y = on[rng.integers(len(on), size=300)]
     g = field.gradient(y, precision="double")

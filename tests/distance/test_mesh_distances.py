@@ -346,7 +346,7 @@ def test_meshes_with_holes(
     search = closest_point_search.search
 
     def counted(surface: Any, *given: Any) -> Any:
-        searched.append(surface.field.jumps is not None)
+        searched.append(surface.field.has_jumps)
         return search(surface, *given)
 
     monkeypatch.setattr(closest_point_search, "search", counted)
@@ -533,7 +533,7 @@ def test_sheets_come_in_turn() -> None:
     """All of them, each once, by their distance."""
     vertices, faces = mesh_of_boxes(random_boxes(np.random.default_rng(5), 4))
     field, backend = hk.WindingNumber(vertices, faces), choose_backend("double")
-    jumps, x = field.prepare(backend).jumps, np.random.default_rng(6).uniform(-1, 1, (20, 3))
+    jumps, x = field.evaluator(backend).jumps, np.random.default_rng(6).uniform(-1, 1, (20, 3))
     assert jumps is not None
     p, always = to_vector3(backend, x), backend.Bool(True)
     after, seen = (backend.Float(-1), backend.UInt32(0xFFFFFFFF)), []

@@ -327,7 +327,7 @@ def check_hits(name: str, precision: Any, count: int, seed: int) -> float:
     assert field.domain is not None
     backend = choose_backend("double")
     ways = [backend.Array3f(np.ascontiguousarray(one.T)) for one in (o, d)]
-    ends = field.domain.prepare(backend).clip(*ways, backend.Float(0), backend.Float(8.0))
+    ends = field.domain.upload(backend).clip(*ways, backend.Float(0), backend.Float(8.0))
     near, far = (np.broadcast_to(to_numpy(one), count).astype(float) for one in ends)
     inside = near < far
     o, d, near, far = o[inside], d[inside], near[inside], far[inside]

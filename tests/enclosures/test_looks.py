@@ -48,6 +48,13 @@ class TaylorBlobs(Blobs):
     (most), so that its range on an interval is that of its ends and of those inside it.
     """
 
+    def evaluator(self, backend: Any, plan: Any = None) -> TaylorEvaluator:
+        return TaylorEvaluator(self, backend)
+
+
+class TaylorEvaluator(hk.fields.SampleEvaluator):
+    """Samples `TaylorBlobs`."""
+
     def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
         look = path.enclose(self.evaluate(path.point(t)))
         slope, sample = look.slope, look.sample
@@ -124,7 +131,7 @@ def test_enclosures_hold_along_the_path_in_both_directions() -> None:
     t, ahead, back = (rng.uniform(0, high, 600) for high in (2.5, 1.5, 1.0))
     path = RayPath(to_vector3(backend, o), to_vector3(backend, d), choose_enclosures(None))
     field = TaylorBlobs()
-    look = field.sample_ray(path, real(t), real(ahead), real(back))
+    look = field.evaluator(backend).sample_ray(path, real(t), real(ahead), real(back))
     closest = np.inf
     for enclosure, sign, length in ((look.forward[-1], 1, ahead), (look.backward[-1], -1, back)):
         assert isinstance(enclosure, ParabolaEnclosure)
@@ -155,6 +162,12 @@ def test_candidates_grow_and_shrink() -> None:
         def evaluate(self, p: Any) -> Sample:
             return Sample(p.x - 1, type(p)(1, 0, 0), (hk.proofs.Lipschitz(math.inf),))
 
+        def evaluator(self, backend: Any, plan: Any = None) -> BisectingEvaluator:
+            return BisectingEvaluator(self, backend)
+
+    class BisectingEvaluator(hk.fields.SampleEvaluator):
+        """Samples `Bisecting`."""
+
         def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
             look = path.enclose(self.evaluate(path.point(t)))
             slopes = SlopeRange.around(look.slope, 0.0)
@@ -183,6 +196,12 @@ def test_enclosures_of_values_of_any_size_miss_nothing(unit: float) -> None:
 
     class Scaled(TaylorBlobs):
         default_level = 0.5 * unit
+
+        def evaluator(self, backend: Any, plan: Any = None) -> ScaledEvaluator:
+            return ScaledEvaluator(self, backend)
+
+    class ScaledEvaluator(TaylorEvaluator):
+        """Samples `Scaled`."""
 
         def sample_ray(self, path: RayPath, t: Any, ahead: Any, back: Any) -> RaySample:
             look = super().sample_ray(path, t, ahead, back)

@@ -144,7 +144,7 @@ def test_clip_loses_nothing_and_adds_only_roundings(kind, precision, seed, log_s
     o, d = random_rays(rng, shift, scale, 4000)
     origins, directions = hb.to_vector3(backend, o), hb.to_vector3(backend, d)
     o, d = (hb.to_numpy(v).astype(np.float64) for v in (origins, directions))
-    t0, t1 = volume.prepare(backend).clip(origins, directions, 0.0, dr.inf)
+    t0, t1 = volume.upload(backend).clip(origins, directions, 0.0, dr.inf)
     t0, t1 = hb.to_numpy(t0).astype(np.float64), hb.to_numpy(t1).astype(np.float64)
 
     exact0, exact1 = exact_clip(volume, o, d)
@@ -174,7 +174,7 @@ def test_a_volume_need_not_be_prepared(kind):
     origins, directions = hb.to_vector3(backend, o), hb.to_vector3(backend, d)
     for plain, ready in zip(
         volume.clip(origins, directions, 0.0, dr.inf),
-        volume.prepare(backend).clip(origins, directions, 0.0, dr.inf),
+        volume.upload(backend).clip(origins, directions, 0.0, dr.inf),
         strict=True,
     ):
         np.testing.assert_allclose(hb.to_numpy(plain), hb.to_numpy(ready), rtol=1e-4)
@@ -213,7 +213,7 @@ def test_clip_can_be_recorded_in_a_loop(points):
     assert (len(hull.normals) > MAX_UNROLLED) == (points == 60)
     o, d = random_rays(rng, np.zeros(3), 1.0, 300)
     origins, directions = hb.to_vector3(backend, o), hb.to_vector3(backend, d)
-    for volume in (hull, hull.prepare(backend)):
+    for volume in (hull, hull.upload(backend)):
 
         def body(k, total, volume=volume):
             t0, t1 = volume.clip(origins, directions, 0.0, 1000.0)
@@ -238,7 +238,7 @@ def test_another_volume_of_the_kind_uses_the_same_kernel(kind):
         volumes: list[Volume] = [ConvexHull.from_points(sphere_points(rng, n)) for n in (50, 90)]
     else:
         volumes = [make_volume(kind, np.array([0.1, k, 0.3]), 1.0 + k) for k in (0.0, 1.5)]
-    volumes = [v.prepare(backend) for v in volumes]
+    volumes = [v.upload(backend) for v in volumes]
     o, d = random_rays(rng, np.zeros(3), 1.0, 64)
     origins, directions = hb.to_vector3(backend, o), hb.to_vector3(backend, d)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -267,7 +267,7 @@ def test_contains_bounds_and_padding_agree(kind, precision):
     for inside in (
         volume.contains_points(x),
         hb.to_numpy(volume.contains(points)),
-        hb.to_numpy(volume.prepare(backend).contains(points)),
+        hb.to_numpy(volume.upload(backend).contains(points)),
     ):
         assert inside[outside <= 0].all()
         assert not inside[outside > margin].any()

@@ -40,7 +40,7 @@ def test_gradients_change_by_no_more_than_promised(field: Any, tight: float) -> 
     backend, rng = choose_backend("double"), np.random.default_rng(0)
     x = rng.uniform(-1.2, 1.2, (20_000, 3))
     radius = 10 ** rng.uniform(-3, -0.5, len(x))
-    prepared = field.prepare(backend)
+    prepared = field.evaluator(backend)
     p = to_vector3(backend, x)
     bound = to_numpy(prepared.gradient_change_bound(p, backend.Float(radius)))
     d = rng.normal(size=x.shape)

@@ -61,7 +61,7 @@ def check_steps(
         points = points.astype(np.float32).astype(np.float64)
     directions = random_directions(generator, count)
     p, d = to_vector3(backend, points), to_vector3(backend, directions)
-    sample = field.prepare(backend).evaluate(p)
+    sample = field.evaluator(backend).evaluate(p)
     slope = dr.dot(sample.gradient, d)
     down, up = _gaps(field, points, generator)
     blur = _blur(sample, points, backend.machine_epsilon)

@@ -29,7 +29,7 @@ def covered(what: Any, o: Any, d: Any, precision: str = "single", **settings: An
     """Which cones of radius 0.01 at a distance of 4 a level set covers in part."""
     backend = choose_backend(precision)
     surface = traced_surface(what, **settings)
-    prepared = surface.prepare(backend, crosses=True)
+    prepared = surface.tracer(backend, crosses=True)
     kind = np.float32 if precision == "single" else np.float64
     rays = (backend.Array3f(np.asarray(a, dtype=kind).T.copy()) for a in np.broadcast_arrays(o, d))
     around = inner_and_outer_ball(surface.volume, backend)

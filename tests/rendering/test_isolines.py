@@ -21,7 +21,7 @@ CIRCLE = hk.SolidAngle(hk.geometry.example_curves.wavy_polygon(24))
 
 
 def covered(lines: hk.Isolines, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    prepared = lines.prepare(BACKEND, size=1.0)
+    prepared = lines.upload(BACKEND, size=1.0)
     p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
     return np.broadcast_to(to_numpy(prepared.contains(p, n)), len(points))
 
@@ -131,14 +131,14 @@ def test_a_function_that_is_constant_on_the_surface_has_no_lines() -> None:
     lines = hk.Isolines(hk.Sphere(1.0), [0.0], width=0.1)
     single = choose_backend("single")
     p = upload_vectors(single, points)
-    assert not to_numpy(lines.prepare(single, 1.0).contains(p, p)).any()
+    assert not to_numpy(lines.upload(single, 1.0).contains(p, p)).any()
 
 
 def test_the_last_of_several_lines_covers_the_others() -> None:
     points, normals = around_cylinder(5000)
     lines = [hk.Isolines("z", [0.0], width=1.0), hk.Isolines("x", [0.0], width=0.5)]
     p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
-    prepared = tuple(one.prepare(BACKEND, 1.0) for one in lines)
+    prepared = tuple(one.upload(BACKEND, 1.0) for one in lines)
     number = to_numpy(isoline_index_at(prepared, p, n, BACKEND.UInt32))
     first, second = (covered(one, points, normals) for one in lines)
     assert (first & second).any()

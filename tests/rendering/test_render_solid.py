@@ -34,7 +34,7 @@ def solid_of(low: float, high: float, volume: Volume) -> CappedSolid:
     field = hk.Gyroid(1.0, domain=volume)
     surface = traced_surface(field, level=level, side=side, tolerance=TOLERANCE)
     assert surface.solid_range == (low, high)
-    return CappedSolid.of(surface, surface.prepare(BACKEND))
+    return CappedSolid.of(surface, surface.tracer(BACKEND))
 
 
 def rays(n: int, seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +151,7 @@ def test_a_ray_that_slipped_through_a_thin_part_crosses_back_at_once() -> None:
 def test_only_solids_are_solid() -> None:
     surface = traced_surface(hk.Gyroid())
     with pytest.raises(ValueError, match="solid"):
-        CappedSolid.of(surface, surface.prepare(BACKEND))
+        CappedSolid.of(surface, surface.tracer(BACKEND))
 
 
 def test_a_normal_is_turned_only_if_it_faces_away() -> None:

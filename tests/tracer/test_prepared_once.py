@@ -21,9 +21,9 @@ class _Ball(hk.Field):
     def __init__(self) -> None:
         self.asked: Counter[Any] = Counter()
 
-    def prepare(self, backend: Any) -> hk.Field:
-        self.asked["prepare", backend] += 1
-        return self
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        self.asked["evaluator", backend] += 1
+        return hk.fields.SampleEvaluator(self, backend)
 
     def extent(self, levels: tuple[float, ...]) -> Any:
         self.asked["extent", levels] += 1

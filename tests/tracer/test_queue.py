@@ -60,7 +60,7 @@ CASES: dict[str, Callable[[], hk.Surface | TracedSurface]] = {
 )
 def test_a_queue_changes_no_bit(name: str, precision: Any) -> None:
     backend = choose_backend(precision)
-    prepared = traced_surface(CASES[name]()).prepare(backend)
+    prepared = traced_surface(CASES[name]()).tracer(backend)
     rng = np.random.default_rng(4)
     n = 3000 if name != "parts" else 1000
     o = rng.normal(size=(n, 3)) * 1.3

@@ -52,7 +52,7 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
     x, d = (v.astype(np.float32).astype(float) for v in (x, d))
     some = CurveOracle(triangles)(x).smooth > 1e-5
     x, d = x[some], unit(d[some])
-    field = hk.WindingNumber(*mesh, method=method).prepare(backend)  # type: ignore[arg-type]
+    field = hk.WindingNumber(*mesh, method=method).evaluator(backend)  # type: ignore[arg-type]
     o, along = to_vector3(backend, x), to_vector3(backend, d)
     start = backend.Float(-1e-20)
     first = JumpCrossing(start, backend.UInt32(NO_FACET), backend.Float(0), along)

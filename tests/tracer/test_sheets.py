@@ -126,9 +126,10 @@ class BruteForceWinding(hk.Field):
     default_level = 0.5
     counts_crossings = False
 
-    @property
-    def jumps(self) -> BruteForceJumps:
-        return BruteForceJumps(self)
+    has_jumps = True
+
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
+        return hk.fields.SampleEvaluator(self, backend, jumps=BruteForceJumps(self))
 
     def __init__(self, vertices: Any, faces: Any, *, jump: float = 1.0) -> None:
         self.vertices = np.asarray(vertices, np.float32).astype(np.float64)
@@ -225,11 +226,11 @@ class BruteForceJumps(hk.fields.Jumps):
 
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> BruteForceWinding:
+    ) -> hk.fields.Evaluator:
         other = type(self.field)(self.field.vertices, self.field.faces)
         passage = Passage.of(o, d, self.field.vertices, self.field.faces)
         other.stretch = Stretch(d, passage, behind, offset)
-        return other
+        return hk.fields.EvaluateOnly(other.evaluate)
 
     def initial_offset(self, o: Vec3, d: Vec3, t_min: Real, active: Mask) -> Real:
         del active
@@ -544,9 +545,10 @@ def test_a_level_that_a_jump_cuts_off_is_within_reach_or_not(short: float, early
 class Staircase(hk.Field):
     """slope * x, and a jump at each of some planes x = const: all steps are known exactly."""
 
-    @property
-    def jumps(self) -> StaircaseJumps:
-        return StaircaseJumps(self)
+    has_jumps = True
+
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
+        return hk.fields.SampleEvaluator(self, backend, jumps=StaircaseJumps(self))
 
     def __init__(self, slope: float, planes: dict[float, float], lift: Real | None = None) -> None:
         self.slope, self.planes, self.lift = slope, planes, lift
@@ -589,9 +591,11 @@ class StaircaseJumps(hk.fields.Jumps):
 
     def continuation(
         self, o: Vec3, d: Vec3, behind: JumpCrossing, ahead: JumpCrossing, offset: Real
-    ) -> Staircase:
+    ) -> hk.fields.Evaluator:
         del o, d, behind, ahead
-        return Staircase(self.field.slope, self.field.planes, offset)
+        return hk.fields.EvaluateOnly(
+            Staircase(self.field.slope, self.field.planes, offset).evaluate
+        )
 
 
 @pytest.mark.few(1)
@@ -804,7 +808,7 @@ def test_rays_that_begin_and_end_anywhere(kind: type[BruteForceWinding]) -> None
 def interval(volume: Any, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     double = choose_backend("double")
     far = double.Float(leaves_domain(o, d))
-    start, end = volume.prepare(double).clip(
+    start, end = volume.upload(double).clip(
         double.Array3f(o.T), double.Array3f(d.T), double.Float(0), far
     )
     return to_numpy(start + 0 * far), to_numpy(end)
@@ -880,7 +884,7 @@ def test_drjit_rays_get_the_same(precision: Any) -> None:
 def test_occlusion_is_a_hit() -> None:
     vertices, faces = MESHES["open cube"]
     backend = choose_backend("single")
-    prepared = traced_surface(BruteForceWinding(vertices, faces)).prepare(backend)
+    prepared = traced_surface(BruteForceWinding(vertices, faces)).tracer(backend)
     o, d = (backend.Array3f(v.T) for v in rays(vertices, 400))
     far = backend.Float(np.random.default_rng(0).uniform(0.1, 4, 400))
     active = dr.arange(backend.UInt32, 400) % 3 != 0
@@ -901,10 +905,11 @@ def test_fields_without_sheets_have_no_facets() -> None:
 
 
 def test_jumps_without_distances_are_refused() -> None:
-    field = Staircase(1.0, {0.5: 1.0})
-    assert not field.jumps.gives_distances
+    jumps = Staircase(1.0, {0.5: 1.0}).evaluator(choose_backend("single")).jumps
+    assert jumps is not None
+    assert not jumps.gives_distances
     with pytest.raises(NotImplementedError, match="define its method distance"):
-        field.jumps.distance(choose_backend("single").Array3f(1, 0, 0))
+        jumps.distance(choose_backend("single").Array3f(1, 0, 0))
 
 
 # --- a level on the value of a side ---------------------------------------------------------
@@ -1034,7 +1039,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
     backend = choose_backend("single")
     for scale in (1.0, 1e-3):
         field = BruteForceWinding(scale * vertices, faces)
-        prepared = traced_surface(field, tolerance=1e-6 * scale).prepare(backend)
+        prepared = traced_surface(field, tolerance=1e-6 * scale).tracer(backend)
         o, d = rays(vertices, 1000, seed=4)
         ray = backend.Array3f((scale * o).T), backend.Array3f(d.T)
         met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))
@@ -1060,7 +1065,7 @@ def test_rays_that_leave_a_sheet_do_not_meet_it_again() -> None:
 def test_polished_hits_stay_on_the_surface_and_sheets_where_they_are() -> None:
     vertices, faces = MESHES["open cube"]
     backend, exact = choose_backend("double"), ExactWinding(vertices, faces)
-    prepared = traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).prepare(backend)
+    prepared = traced_surface(BruteForceWinding(vertices, faces), tolerance=1e-4).tracer(backend)
     o, d = rays(vertices, 500, closest=1e-2)
     ray = backend.Array3f(o.T), backend.Array3f(d.T)
     met = intersect_surface(prepared, *ray, math.inf, backend.Bool(True))

@@ -209,7 +209,7 @@ def test_powers_that_overflow() -> None:
 def test_steps_proved_by_values_end_before_the_level(text: str) -> None:
     """The level is at x = 1. A step that is a thousandth longer than what was proved passes it."""
     backend = choose_backend("double")
-    field = hk.expression(text).prepare(backend)
+    field = hk.expression(text).evaluator(backend)
     path = Ray(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_enclosures(None))
     t, levels = backend.Float(0.25), Levels((backend.Float(0.0),))
     ahead = backend.Float([0.5, 0.75 - 5e-4, 0.75 + 1e-9])
@@ -225,7 +225,7 @@ def test_a_slope_proves_that_a_level_is_taken_no_sooner_than_it_is() -> None:
     backend = choose_backend("double")
     path = Ray(backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0), choose_enclosures(None))
     t, reach, none = (backend.Float(length) for length in (0.5, 1.0, 0.0))
-    look = hk.expression("1 - x").sample_ray(path, t, reach, none)
+    look = hk.expression("1 - x").evaluator(backend).sample_ray(path, t, reach, none)
     gaps, lengths = (
         LevelGaps(backend.Float(0.5), backend.Float(np.inf)),
         backend.Float([0.4998, 0.5002]),
@@ -340,10 +340,10 @@ def test_numbers_are_told_before_they_are_data_of_a_kernel() -> None:
     steep, flat = Steps(), Steps(steepness=1.0)
     backend = choose_backend("single")
     assert steep.is_abrupt
-    assert steep.prepare(backend).is_steep
-    assert not flat.prepare(backend).is_steep
+    assert steep.evaluator(backend).is_steep
+    assert not flat.evaluator(backend).is_steep
     small = hk.Sphere(1e-5), hk.Cylinder(1e-3, 0.0002), hk.Cuboid((0.0002, 2.0, 2.0))
-    assert not any(shape.prepare(backend).is_steep for shape in small)
+    assert not any(shape.evaluator(backend).is_steep for shape in small)
 
 
 def meets(at: float, o: FloatArray, d: FloatArray) -> BoolArray:

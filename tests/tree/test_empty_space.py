@@ -62,7 +62,9 @@ def test_coarse_samples_are_w_less_a_whole_number(precision: str) -> None:
     x = np.random.default_rng(1).normal(size=(4000, 3))
     backend = choose_backend(precision)  # type: ignore[arg-type]
     p = to_vector3(backend, x)
-    sample = field.prepare(backend).evaluate_modulo_one(p)
+    modulo_one = field.evaluator(backend).modulo_one
+    assert modulo_one is not None
+    sample = modulo_one.evaluate(p)
     error = to_numpy(backend.Float(sample.value_error))
     whole = winding_sum(field.mesh.vertices[field.mesh.triangles])(x)
     off = to_numpy(sample.value) - whole

@@ -493,7 +493,15 @@ def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[An
         """The sample at p, by the evaluator of the class that was wrapped."""
         return evaluator(self, backend_of(p)).evaluate(p)
 
+    cast("Any", evaluate).is_derived = True  # `_stated_evaluate` passes it over
     return evaluate
+
+
+def _stated_evaluate(kind: type[Field]) -> Callable[[Any, Vec3], Sample]:
+    """The `evaluate` that a class of fields states itself, or inherits from one that does, and that
+    was not made of its `evaluator`."""
+    methods = [vars(base)["evaluate"] for base in kind.__mro__ if "evaluate" in vars(base)]
+    return next(method for method in methods if not getattr(method, "is_derived", False))
 
 
 class SampleEvaluator(Evaluator):
@@ -521,18 +529,21 @@ class SampleEvaluator(Evaluator):
         is_steep: bool = False,
     ) -> None:
         self.field = _with_ready_fields(field, backend)
+        self._evaluate = _stated_evaluate(type(field))
         self.jumps, self.modulo_one, self.patches = jumps, modulo_one, patches
         self.variable_accuracy, self.is_steep = variable_accuracy, is_steep
 
     def evaluate(self, p: Vec3) -> Sample:
-        return self.field.evaluate(p)
+        return self._evaluate(self.field, p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        raise NotImplementedError(
-            f"{type(self.field).__name__} gives no second derivatives: let its method evaluator "
-            "return a subclass of harnack.fields.SampleEvaluator that defines hessian(p), or ask "
-            'for what needs none, such as signed_distance(..., method="first_order")'
-        )
+        if type(self.field).hessian is Field.hessian:
+            raise NotImplementedError(
+                f"{type(self.field).__name__} gives no second derivatives: define its method "
+                "hessian(p), or ask for what needs none, such as signed_distance(..., "
+                'method="first_order")'
+            )
+        return self.field.hessian(p)
 
     def differentiable_value(self, p: Vec3) -> Real:
         if any(map(dr.grad_enabled, self.field.differentiable_parameters())):

@@ -15,11 +15,11 @@ import contextlib
 import dataclasses
 import functools
 import gc
+import inspect
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
-from types import MethodType
 from typing import Any, cast
 
 import drjit as dr
@@ -257,7 +257,7 @@ def _find_arrays(data: Any) -> Iterator[Any]:
             pending += node.values()
         elif isinstance(node, list | tuple):
             pending += node
-        elif isinstance(node, MethodType):
+        elif inspect.ismethod(node):
             pending.append(node.__self__)
         elif dataclasses.is_dataclass(node) or hasattr(node, "__dict__"):
             pending += vars(node).values()
