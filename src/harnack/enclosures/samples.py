@@ -161,8 +161,9 @@ def validate_samples(
             raise TypeError(
                 f"{name}: Sample.gradient is {describe_type(gradient)}, no 3-vector: {_SAMPLE_HELP}"
             )
-        # Derivatives of the value that do not come from p would be lost.
-        if not self.has_parameter_derivatives and not dr.grad_enabled(p):
+        # Derivatives of the value that do not come from p would be lost. (Evaluators lack the
+        # attribute: the field is asked.)
+        if not getattr(self, "has_parameter_derivatives", True) and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)
 
