@@ -54,13 +54,13 @@ HARMONIC = ("triangle", "wavy", "large trefoil", "holes", "Y 0,0 + x", "Y 12,-7"
 
 def gradient(field: hk.Field, points: np.ndarray) -> np.ndarray:
     backend = choose_backend("double")
-    sample = field.prepare(backend).evaluate(to_vector3(backend, points))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, points))
     return np.broadcast_to(to_numpy(sample.gradient), points.shape)
 
 
 def hessian(field: hk.Field, points: np.ndarray, precision: Any = "double") -> np.ndarray:
     backend = choose_backend(precision)
-    rows = field.prepare(backend).hessian(to_vector3(backend, points))
+    rows = field.evaluator(backend).hessian(to_vector3(backend, points))
     return np.stack([np.broadcast_to(to_numpy(row), points.shape) for row in rows], axis=1).astype(
         np.float64
     )
