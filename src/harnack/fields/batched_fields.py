@@ -2,7 +2,7 @@
 a field. A field is a function f of space. `BatchedField` gives its values, derivatives and error
 bounds at NumPy points, as NumPy arrays. The computation itself is a Dr.Jit kernel, with one point
 per lane. Many such fields are sums over sources in a tree, where a far cluster of sources is
-approximated as one source; this causes a truncation error. `FieldCache` and `cached_prepare` cache
+approximated as one source; this causes a truncation error. `FieldCache` and `cached_upload` cache
 results that are computed or uploaded once per field."""
 
 from __future__ import annotations
@@ -219,7 +219,13 @@ def _required_hessian(values: PointValues) -> SymmetricMatrix:
 
 
 Prepare = TypeVar("Prepare", bound=Callable[..., Field])
+Upload = TypeVar("Upload", bound=Callable[..., Any])
 Value = TypeVar("Value")
+
+# The largest number of uploads of a field, for other backends or arguments, that `cached_upload`
+# keeps.
+_MAX_UPLOADS = 16
+_NOT_UPLOADED = object()
 
 
 class FieldCache(Generic[Value]):
@@ -239,10 +245,11 @@ class FieldCache(Generic[Value]):
         """The value of a field for this key. It is the cached value if that was made for the same
         key, and no attribute of the field was set since then. Otherwise it is the result of make(),
         which is then cached. (A value that is the field itself is not cached, as it would keep the
-        field alive.)"""
+        field alive.) Attributes that are cached properties do not count, because they follow from
+        the others."""
         if id(field) in self._kept:
             kept_key, attributes, value = self._kept[id(field)]
-            now = vars(field)
+            now = _set_attributes(field)
             same = attributes.keys() == now.keys()
             # Attributes are compared by identity: it is fast, and arrays have no single truth value
             # of ==.
@@ -254,8 +261,51 @@ class FieldCache(Generic[Value]):
                 # Drop the value when the field is deleted, if it is still there (None: no error if
                 # not), but not at the end of the program.
                 finalize(field, self._kept.pop, id(field), None).atexit = False
-            self._kept[id(field)] = key, {**vars(field)}, value
+            self._kept[id(field)] = key, _set_attributes(field), value
         return value
+
+
+def _set_attributes(field: Field) -> dict[str, Any]:
+    """The attributes of a field without those that are cached properties of its class."""
+    kind = type(field)
+    return {
+        name: value
+        for name, value in vars(field).items()
+        if not isinstance(getattr(kind, name, None), functools.cached_property)
+    }
+
+
+def cached_upload(upload: Upload) -> Upload:
+    """Decorator of a field's method that uploads data to a backend, such as `_upload(self, backend,
+    *, traced)`. The decorated method uploads only once for each field, backend and arguments, as
+    long as no attribute of the field is set. Of uploads with many different arguments the last
+    ones are kept.
+
+    The arguments are hashable. The data must not refer to the field, or neither of them would ever
+    be deleted.
+
+    A field with parameters is uploaded at each call: a parameter may change in place, and its
+    derivatives belong to a single trace.
+    """
+    # For each field the data by backend and arguments, in the order of their last use.
+    cache: FieldCache[dict[Any, Any]] = FieldCache()
+
+    @functools.wraps(upload)
+    def cached(self: Field, backend: Backend, *arguments: Any, **settings: Any) -> Any:
+        """The data: the cached ones, unless the field has parameters."""
+        if self.differentiable_parameters():
+            return upload(self, backend, *arguments, **settings)
+        uploads = cache.get(self, None, dict)
+        key = backend, arguments, tuple(sorted(settings.items()))
+        data = uploads.pop(key, _NOT_UPLOADED)
+        if data is _NOT_UPLOADED:
+            data = upload(self, backend, *arguments, **settings)
+        uploads[key] = data
+        while len(uploads) > _MAX_UPLOADS:
+            del uploads[next(iter(uploads))]
+        return data
+
+    return cast("Upload", cached)
 
 
 def cached_prepare(prepare: Prepare) -> Prepare:
