@@ -18,6 +18,7 @@ import numpy as np
 from harnack.backend.validation import as_real_array
 from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
 from harnack.fields.analytic.waves import mean_wavelength
+from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Box
@@ -274,7 +275,7 @@ class FourierSeries(Field):
         del plan
         return _SeriesEvaluator(self._upload(backend))
 
-    # TODO: @cached_upload
+    @cached_upload
     def _upload(self, backend: Backend) -> CosineSums:
         """The coefficients and bounds of the series, uploaded to a backend, in an object that
         evaluates it."""
