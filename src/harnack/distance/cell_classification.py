@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Levels
-    from harnack.fields.field import Field, Sample
+    from harnack.fields.evaluator import Evaluator
+    from harnack.fields.field import Sample
     from harnack.geometry import Volume
     from harnack.tracer import TracedSurface
 
@@ -64,12 +65,12 @@ class ClipCurveDescent:
     set. On this curve f = level and h = 0, where h is the signed distance from the boundary of the
     domain. The boundary may have several smooth faces, which meet at edges.
 
-    field, domain: the function f and its domain, prepared for the backend.
+    evaluator, domain: the function f and its domain, on the backend.
     levels: the values of f on the surface; at a point the level nearest to f counts.
     """
 
     backend: Backend
-    field: Field
+    evaluator: Evaluator
     levels: Levels
     domain: Volume
 
@@ -212,7 +213,7 @@ class ClipCurveDescent:
         normals along t, computed by differences.
         """
         real, vector = self.backend.Float, self.backend.Array3f
-        sample = self.field.evaluate(y)
+        sample = self.evaluator.evaluate(y)
         gradient, scale = vector(sample.gradient), max_norm(y)
         gradient_norm, n = safe_norm(gradient), vector(self.domain.outward_normal(y))
         u = gradient / gradient_norm
@@ -241,7 +242,7 @@ class ClipCurveDescent:
         # The step of the differences; u' . t and n' . t.
         step = self.backend.machine_epsilon**0.5 * fmax(scale, real(1e-30))
         next_point = dr.fma(vector(step), t, y)
-        u_change = dr.dot(vector(self.field.evaluate(next_point).gradient) - gradient, t) / (
+        u_change = dr.dot(vector(self.evaluator.evaluate(next_point).gradient) - gradient, t) / (
             gradient_norm * step
         )
         n_change = dr.dot(vector(self.domain.outward_normal(next_point)) - n, t) / step
@@ -332,22 +333,24 @@ class CellClassifier:
     surface: TracedSurface
 
     def __post_init__(self) -> None:
-        """Prepare the surface in double precision, and the descent to the clip curve if its domain
+        """Upload the surface in double precision, and the descent to the clip curve if its domain
         cuts it."""
         self._backend = choose_backend("double")
-        self._prepared = self.surface.prepare(self._backend)
-        self._levels = self._prepared.levels
+        self._tracer = self.surface.tracer(self._backend)
+        self._levels = self._tracer.levels
         self._volume = _domain(self.surface)
-        self._has_hessian = has_hessian(self._backend, self._field)
+        self._has_hessian = has_hessian(self._backend, self._evaluator)
         self._clip_descent = None
-        if self._volume is not None and self.surface.field.jumps is None:
-            volume = self._volume.prepare(self._backend)
-            self._clip_descent = ClipCurveDescent(self._backend, self._field, self._levels, volume)
+        if self._volume is not None and not self.surface.field.has_jumps:
+            volume = self._volume.upload(self._backend)
+            self._clip_descent = ClipCurveDescent(
+                self._backend, self._evaluator, self._levels, volume
+            )
 
     @property
-    def _field(self) -> Field:
-        """The function f, prepared for the backend."""
-        return self._prepared.field
+    def _evaluator(self) -> Evaluator:
+        """The evaluator of the function f."""
+        return self._tracer.evaluator
 
     def nonempty_cells(self, center: FloatArray, half: FloatArray) -> SurfaceCells:
         """Return the cubes that are not proved to be free of the surface. Each has the slab (two
@@ -458,11 +461,11 @@ class CellClassifier:
         a surface point y, |f(p) - level + g.(y - p)| <= E. Divided by |g|, this is the slab.
         """
         real, vector, radius = self._backend.Float, self._backend.Array3f, radii.x
-        sample = self._field.evaluate(p)
+        sample = self._evaluator.evaluate(p)
         clearance = real(0)
         if sample.all_promises:
             clearance = level_distance_lower_bound(
-                self._backend, self._field, self._levels, p, sample
+                self._backend, self._evaluator, self._levels, p, sample
             )
         residual, gradient_norm = (
             -self._levels.offset_to_nearest(sample.value),  # f - level
@@ -478,7 +481,7 @@ class CellClassifier:
             & (linear_error < FAR_SENTINEL * gradient_norm)
         )
         # A slab holds the surface only if a single level, without jumps, passes through the ball.
-        if len(self._levels.values) > 1 or self.surface.field.jumps is not None:
+        if len(self._levels.values) > 1 or self.surface.field.has_jumps:
             is_slab &= False
         elif self._levels.period is not None:
             # f - level changes by at most |g| radius + error in the ball, so that no other level
@@ -507,23 +510,23 @@ class CellClassifier:
         and an upper bound of the curvature of the surface at the point.
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
-        if self.surface.field.jumps is not None:
+        if self.surface.field.has_jumps:
             # No plane is known to approximate the surface: the radius is 0.
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
         point = self._newton_point(p, radius)
         is_found = point.x < 0.5 * FAR_SENTINEL  # a missing point is at `FAR_SENTINEL`
         y = dr.select(is_found, point, p)
-        gradient = self._field.evaluate(y).gradient
+        gradient = self._evaluator.evaluate(y).gradient
         n = gradient / safe_norm(gradient)
         # A cell without a slab gets the tangent plane at its surface point.
         is_plane = is_found & ~(dr.squared_norm(normal) > 0) & dr.isfinite(dr.squared_norm(n))
         # Up to the far side of the ball around the cell, if no boundary is nearer.
-        plane_radius, boundary = radius + safe_norm(y - p), self._field.boundary
+        plane_radius, boundary = radius + safe_norm(y - p), self.surface.field.boundary
         if boundary is not None and boundary.closest_point is not None:
             plane_radius = fmin(plane_radius, safe_norm(boundary.closest_point(y) - y))
         curvature = unknown
         if self._has_hessian:
-            uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._field.hessian(y))
+            uu, vv, uv = TangentPlane.of(gradient).restrict_hessian(self._evaluator.hessian(y))
             # The Frobenius norm of the Hessian in the tangent plane is at least its largest
             # eigenvalue.
             bound = dr.sqrt(dr.fma(uu, uu, dr.fma(vv, vv, 2 * uv * uv))) / safe_norm(gradient)
@@ -566,7 +569,7 @@ class CellClassifier:
             last: the length of the step before.
             k: the number of steps so far.
             """
-            sample = self._field.evaluate(y)
+            sample = self._evaluator.evaluate(y)
             gradient_norm = safe_norm(sample.gradient)
             off_level = self._levels.offset_to_nearest(sample.value)
             newton_step = off_level / gradient_norm
@@ -612,12 +615,12 @@ class CellClassifier:
                 d = dr.select(k == number, vector(*diagonal) / 3**0.5, d)
             # It begins at the surface of the ball and ends at its other side.
             o = dr.fma(vector(-radius), d, p)
-            ray_hit = self._prepared.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
+            ray_hit = self._tracer.first_hit(o, d, real(0), 2 * radius, self._backend.Bool(True))
             is_hit = ray_hit.status == int(RayStatus.HIT)
             y = dr.fma(vector(ray_hit.t), d, o)
             square = dr.squared_norm(y - p)
             is_nearer = is_hit & (square < best)
-            is_nearer &= is_on_surface(self._prepared, y, ray_hit, is_nearer)
+            is_nearer &= is_on_surface(self._tracer, y, ray_hit, is_nearer)
             return dr.select(is_nearer, y, point), dr.select(is_nearer, square, best), k + 1
 
         def is_active(point: Vec3, best: Real, k: Any) -> Mask:

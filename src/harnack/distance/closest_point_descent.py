@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.distance.exclusion_ball import Rows
     from harnack.enclosures import Levels
-    from harnack.fields.field import Field, Sample
+    from harnack.fields.evaluator import Evaluator
+    from harnack.fields.field import Sample
 
 __all__ = ["ClosestPointDescent"]
 
@@ -101,20 +102,20 @@ class ClosestPointDescent:
     Newton's method and by descents along the surface. y is the current point of a search. The
     uncertainty of the level is the length by which rounding may have moved the level set.
 
-    field: the function f, prepared for the backend.
+    evaluator: samples the function f.
     levels: the values of f on the surface. At a point the level nearest to f counts.
-    has_hessian: whether the field can compute second derivatives of f.
+    has_hessian: whether it can compute second derivatives of f.
     """
 
     backend: Backend
-    field: Field
+    evaluator: Evaluator
     levels: Levels
     has_hessian: bool
 
     @classmethod
-    def of(cls, backend: Backend, field: Field, levels: Levels) -> ClosestPointDescent:
-        """Make the descent, and find out whether the field has a Hessian."""
-        return cls(backend, field, levels, has_hessian(backend, field))
+    def of(cls, backend: Backend, evaluator: Evaluator, levels: Levels) -> ClosestPointDescent:
+        """Make the descent, and find out whether the evaluator has a Hessian."""
+        return cls(backend, evaluator, levels, has_hessian(backend, evaluator))
 
     def newton(self, x: Vec3, start: Vec3, limit: Real) -> tuple[Vec3, Real, Mask, Mask]:
         """Run Newton's method for the closest-point equations f(y) = level and (x - y) parallel to
@@ -151,7 +152,7 @@ class ClosestPointDescent:
             """
             # The rounding error of f is not needed here. Without it the compiler drops the code
             # that computes it, which takes as long as that of f itself.
-            sample = dataclasses.replace(self.field.evaluate(y), value_error=0.0)
+            sample = dataclasses.replace(self.evaluator.evaluate(y), value_error=0.0)
             # The step to the level and the step along the surface, both from y.
             residual, state = self._state_at(y, sample)
             # (1: the whole step.)
@@ -202,9 +203,9 @@ class ClosestPointDescent:
         by about s times the curvature; the part of x - y along the surface that this causes is less
         than what `descend` allows.
         """
-        sample = self.field.evaluate(y)
+        sample = self.evaluator.evaluate(y)
         residual, state = self._state_at(y, sample)
-        rows = self.field.hessian(y) if self.has_hessian else None
+        rows = self.evaluator.hessian(y) if self.has_hessian else None
         # The step along the surface is not made here, so its largest fraction (1) does not matter.
         _, is_minimum = self._tangential_step(x, state, self.backend.Float(1), rows)
         gradient_norm = lengths.safe_norm(state.gradient)
@@ -339,7 +340,7 @@ class ClosestPointDescent:
 
     def _evaluate(self, y: Vec3) -> tuple[Real, _DescentState]:
         """Evaluate f at y. Returns f - level for the nearest level, and the descent state at y."""
-        return self._state_at(y, self.field.evaluate(y))
+        return self._state_at(y, self.evaluator.evaluate(y))
 
     def _state_at(self, y: Vec3, sample: Sample) -> tuple[Real, _DescentState]:
         """Return f - level for the level nearest in value, and the state of a descent at y.
@@ -532,7 +533,7 @@ class ClosestPointDescent:
         differences make a descent slower, but not wrong.
         """
         if self.has_hessian:
-            return plane.restrict_hessian(self.field.hessian(y))
+            return plane.restrict_hessian(self.evaluator.hessian(y))
         vector, count = self.backend.Array3f, self.backend.UInt32
         h = fmax(self.backend.machine_epsilon**0.5 * length, 1e-30)  # not 0, as it divides
 
@@ -547,7 +548,7 @@ class ClosestPointDescent:
             # Nodes 0 and 1 are along u, 2 and 3 along v; odd nodes have the step -h, so that their
             # terms are subtracted.
             direction, step = dr.select(k < 2, plane.u, plane.v), dr.select((k & 1) == 0, h, -h)
-            gradient = self.field.evaluate(dr.fma(vector(step), direction, y)).gradient
+            gradient = self.evaluator.evaluate(dr.fma(vector(step), direction, y)).gradient
             term = gradient * (0.5 / step)
             new_u, new_v = dr.select((k & 1) == 0, term, along_u + term), along_v + term
             new_v = dr.select((k & 1) == 0, term, new_v)

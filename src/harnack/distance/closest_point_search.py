@@ -46,6 +46,7 @@ from harnack.distance.tangent_plane import first_order_distance, in_batches
 from harnack.fields.batch_evaluation import morton_order
 from harnack.fields.capabilities import NO_FACET, exactly_sampled
 from harnack.fields.clearance import level_distance_lower_bound
+from harnack.fields.evaluator import Evaluator
 from harnack.fields.field import Field
 from harnack.geometry.neighborhoods import kd_tree
 
@@ -150,43 +151,40 @@ def _find_sorted(
     progress: called with a message before each stage.
     is_proved: whether cells are subdivided for larger lower bounds.
     """
-    triangles = LevelTriangles.of(surface)
+    triangles = LevelTriangles.of(surface, backend)
     if triangles is not None and triangles.is_complete:
         return _closest_on_mesh(backend, surface, levels, triangles, points)
-    evaluator = _QueryEvaluator(backend, surface, levels)
-    x, guess, residual, lower, estimate = evaluator.evaluate(points)
+    query = _Query(backend, surface, levels)
+    x, guess, residual, lower, estimate = query.evaluate(points)
     if triangles is not None:
         guess = _with_mesh_points(x, guess, triangles)
-    if surface.field.jumps is not None:
-        guess = evaluator.with_jump_points(x, guess)
+    if surface.field.has_jumps:
+        guess = query.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
-    batch_field = surface.field.for_ray_count(_SAMPLES_PER_POINT * len(x))
     # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
-    jumps = batch_field.jumps
+    jumps = surface.evaluator(backend).jumps
     smooth = None if jumps is None or surface.clip_volume is not None else jumps.smooth_field()
     if smooth is None:
-        result = search(surface, x, InitialGuess(guess, estimate), evaluator, tolerance, progress)
+        result = search(surface, x, InitialGuess(guess, estimate), query, tolerance, progress)
     else:
         result = _search_smooth_part(
-            evaluator, smooth, x, InitialGuess(guess, estimate), tolerance, progress
+            query, smooth, x, InitialGuess(guess, estimate), tolerance, progress
         )
-    result.closest = _with_singular_points(
-        surface, x, evaluator.remove_truncation(x, result.closest)
-    )
-    if surface.field.jumps is None:
+    result.closest = _with_singular_points(surface, x, query.remove_truncation(x, result.closest))
+    if not surface.field.has_jumps:
         proved = np.maximum(lower, result.lower_bounds)
         result.closest = _with_gradient_feet(
-            evaluator, x, result.closest, estimate, proved + tolerance.length
+            query, x, result.closest, estimate, proved + tolerance.length
         )
         result.closest = _with_crease_points(
-            evaluator, x, result.closest, proved + _SETTLED * tolerance.length
+            query, x, result.closest, proved + _SETTLED * tolerance.length
         )
     distance = _length(x - result.closest)
     # A closest point may be nearer than the proved lower bound: either rounding has moved it off
     # the surface, or a promise of the field does not hold.
     is_below_bound = distance < lower
     allowed_error = np.zeros(len(x))
-    allowed_error[is_below_bound] = 4 * evaluator.level_uncertainty(result.closest[is_below_bound])
+    allowed_error[is_below_bound] = 4 * query.level_uncertainty(result.closest[is_below_bound])
     allowed_error += (
         _ROUNDING * backend.machine_epsilon * (np.abs(x).max(axis=1, initial=0.0) + lower)
     )
@@ -199,7 +197,7 @@ def _find_sorted(
 
 
 def _with_gradient_feet(
-    evaluator: _QueryEvaluator, points: FloatArray, closest: FloatArray, estimate: FloatArray,
+    query: _Query, points: FloatArray, closest: FloatArray, estimate: FloatArray,
     settled: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """Return the closest points of queries, replaced where f is a distance: there the surface point
@@ -215,7 +213,7 @@ def _with_gradient_feet(
     rows = np.flatnonzero(~(distance <= settled) & (estimate <= settled))
     if not len(rows):
         return closest
-    feet = evaluator.gradient_feet(points[rows])
+    feet = query.gradient_feet(points[rows])
     is_nearer = _length(points[rows] - feet) < np.nan_to_num(distance[rows], nan=np.inf)
     closest = closest.copy()
     closest[rows[is_nearer]] = feet[is_nearer]
@@ -223,7 +221,7 @@ def _with_gradient_feet(
 
 
 def _with_crease_points(
-    evaluator: _QueryEvaluator, points: FloatArray, closest: FloatArray, settled: FloatArray
+    query: _Query, points: FloatArray, closest: FloatArray, settled: FloatArray
 ) -> FloatArray:
     """Return the closest points of queries on a combination of solids, replaced where descents
     along one operand alone, or along the creases at which operands meet, find nearer ones
@@ -234,17 +232,16 @@ def _with_crease_points(
     settled: (n,) the length up to which a distance needs no improvement: its proved lower bound and
         a fraction of the tolerance.
     """
-    backend, surface = evaluator.backend, evaluator.surface
+    backend, surface = query.backend, query.surface
     operands = surface.field.operands()
     rows = np.flatnonzero(~(_length(points - closest) <= settled))
     if not 1 < len(operands) <= MAX_OPERANDS or not len(rows):
         return closest
     descents = (
-        _QueryEvaluator(backend, replace(surface, field=operand), evaluator.levels)
-        for operand in operands
+        _Query(backend, replace(surface, field=operand), query.levels) for operand in operands
     )
-    creases = CreaseSearch(backend, evaluator.prepared, evaluator.levels, tuple(descents))
-    candidates = evaluator.inside_domain_or_nan(creases.candidates(points[rows], closest[rows]))
+    creases = CreaseSearch(backend, query.evaluator, query.levels, tuple(descents))
+    candidates = query.inside_domain_or_nan(creases.candidates(points[rows], closest[rows]))
     is_found = ~np.isnan(candidates[:, 0])
     closest = closest.copy()
     closest[rows[is_found]] = candidates[is_found]
@@ -252,7 +249,7 @@ def _with_crease_points(
 
 
 def _search_smooth_part(
-    evaluator: _QueryEvaluator,
+    query: _Query,
     smooth: Field,
     points: FloatArray,
     known: InitialGuess,
@@ -263,7 +260,7 @@ def _search_smooth_part(
     function f jumps, such as triangles). The result also takes account of the closest points on
     jump surfaces.
 
-    evaluator: evaluates f and runs descents.
+    query: evaluates f and runs descents.
     smooth: a function without jumps that differs from f by a constant between jump surfaces
         (`Jumps.smooth_field`).
     points: (n, 3) the query points.
@@ -278,20 +275,21 @@ def _search_smooth_part(
     does not have the level there, or if a jump surface is nearer than all accepted points: the
     nearest point of the jump surface need not belong to the surface.
     """
-    backend, surface = evaluator.backend, evaluator.surface
-    smoothed = replace(surface, field=smooth).with_call_cache(begins=True)
-    smooth_evaluator = _QueryEvaluator(backend, smoothed, smoothed.target_levels(backend))
+    backend, surface = query.backend, query.surface
+    ray_count = _SAMPLES_PER_POINT * len(points)
+    smoothed = replace(surface, field=smooth, ray_count=ray_count).with_call_cache(begins=True)
+    smooth_query = _Query(backend, smoothed, smoothed.target_levels(backend))
     # The last result: first-order estimates of the distances.
-    estimate = smooth_evaluator.evaluate(points)[-1]
+    estimate = smooth_query.evaluate(points)[-1]
     result = search(
         smoothed,
         points,
         InitialGuess(known.closest, estimate, on_boundary=False),
-        smooth_evaluator,
+        smooth_query,
         tolerance,
         progress,
     )
-    jump_gap = evaluator.distance_to_jumps(points)
+    jump_gap = query.distance_to_jumps(points)
     rounding = (
         _ROUNDING * backend.machine_epsilon * (np.abs(points).max(axis=1, initial=0.0) + jump_gap)
     )
@@ -301,9 +299,7 @@ def _search_smooth_part(
     nearer_rows = np.flatnonzero(
         _length(points - result.closest) < np.nan_to_num(distance, nan=np.inf) - rounding
     )
-    candidates = smooth_evaluator.remove_truncation(
-        points[nearer_rows], result.closest[nearer_rows]
-    )
+    candidates = smooth_query.remove_truncation(points[nearer_rows], result.closest[nearer_rows])
     # f itself must have the level there, not only `smooth`.
     values = np.asarray(surface.field.value(candidates, precision="double"))
     is_level = np.abs(values[:, None] - surface.level_values).min(axis=1) < _LEVEL_MATCH
@@ -315,7 +311,7 @@ def _search_smooth_part(
     if len(unsettled_rows):
         guess = InitialGuess(closest[unsettled_rows], known.estimate[unsettled_rows])
         # Search again with f itself, by rays.
-        retry = search(surface, points[unsettled_rows], guess, evaluator, tolerance, progress)
+        retry = search(surface, points[unsettled_rows], guess, query, tolerance, progress)
         closest[unsettled_rows], lower[unsettled_rows] = (
             retry.closest,
             np.maximum(lower[unsettled_rows], retry.lower_bounds),
@@ -357,12 +353,12 @@ def _closest_on_mesh(
     mesh: the triangles of the surface.
     points: (n, 3) the queries.
     """
-    prepared, nearest = surface.evaluator(backend), mesh.upload(backend)
+    evaluator, nearest = surface.evaluator(backend), mesh.upload(backend)
 
     def compute(p: Vec3) -> tuple[Real | Vec3, ...]:
         """Return four results for the query p: p as rounded, the nearest triangle point, the
         distance from it, and f - level."""
-        residual = -levels.offset_to_nearest(prepared.evaluate(p).value)
+        residual = -levels.offset_to_nearest(evaluator.evaluate(p).value)
         offset = nearest(p)
         return p, p + offset, safe_norm(offset), residual
 
@@ -389,7 +385,7 @@ def _with_mesh_points(points: FloatArray, guess: FloatArray, mesh: LevelTriangle
 
 
 @dataclass(frozen=True)
-class _QueryEvaluator:
+class _Query:
     """Evaluates the function f of one surface on a backend, and runs descents from points near the
     surface to closest points, for arrays of query points. Facets are the triangles or other pieces
     at which f may jump.
@@ -398,7 +394,7 @@ class _QueryEvaluator:
 
     The attributes with an underscore are made from the given ones:
 
-    _field: f, prepared for the backend.
+    _evaluator: samples f on the backend.
     _descent, _exact_descent: the descent on the level set of f; and, if f is the approximation of a
         sum with a truncation error, on the level set of the exact sum (else None).
     _domain, _clip: the field's domain; and the descent to the clip curve, in which the boundary of
@@ -413,28 +409,31 @@ class _QueryEvaluator:
     def __post_init__(self) -> None:
         """Make the attributes with an underscore. It uses `object.__setattr__`, as the dataclass is
         frozen."""
-        backend, field = self.backend, self.surface.evaluator(self.backend)
+        backend, evaluator = self.backend, self.surface.evaluator(self.backend)
+        domain = self.surface.field.domain
         assign = object.__setattr__
-        assign(self, "_field", field)
-        exact = exactly_sampled(field, backend)
-        assign(self, "_descent", ClosestPointDescent.of(backend, field, self.levels))
+        assign(self, "_evaluator", evaluator)
+        exact = exactly_sampled(evaluator, backend)
+        assign(self, "_descent", ClosestPointDescent.of(backend, evaluator, self.levels))
         assign(
             self,
             "_exact_descent",
             ClosestPointDescent.of(backend, exact, self.levels)
-            if field.variable_accuracy is not None
+            if evaluator.variable_accuracy is not None
             else None,
         )
-        domain = field.domain and field.domain.prepare(backend)
+        domain = domain and domain.upload(backend)
         assign(self, "_domain", domain)
-        assign(self, "_clip", domain and ClipCurveDescent(backend, field, self.levels, domain))
+        assign(self, "_clip", domain and ClipCurveDescent(backend, evaluator, self.levels, domain))
         # For a function with jumps, closest points are searched by rays from the query
         # (`compass_search`), in directions that differ less and less. Single precision is too
         # coarse for such small angles.
         double = choose_backend("double")
-        assign(self, "_tracer", self.surface.prepare(double) if field.jumps is not None else None)
+        assign(
+            self, "_tracer", self.surface.tracer(double) if evaluator.jumps is not None else None
+        )
 
-    _field: Field = dataclasses.field(init=False)
+    _evaluator: Evaluator = dataclasses.field(init=False)
     _descent: ClosestPointDescent = dataclasses.field(init=False)
     _exact_descent: ClosestPointDescent | None = dataclasses.field(init=False)
     _domain: Volume | None = dataclasses.field(init=False)
@@ -442,9 +441,9 @@ class _QueryEvaluator:
     _tracer: Any = dataclasses.field(init=False)
 
     @property
-    def prepared(self) -> Field:
-        """The function f, prepared for the backend."""
-        return self._field
+    def evaluator(self) -> Evaluator:
+        """The evaluator of the function f."""
+        return self._evaluator
 
     def gradient_feet(self, points: FloatArray) -> FloatArray:
         """Return the points of the surface (n, 3) to which Newton's method along the gradient leads
@@ -472,16 +471,16 @@ class _QueryEvaluator:
             """Return five results for the query p: p as rounded; a point of the surface known near
             it, or NaN; f - level; a proved lower bound of the distance from the level set; and the
             first-order estimate of that distance."""
-            sample = self._field.evaluate(p)
+            sample = self._evaluator.evaluate(p)
             residual = -self.levels.offset_to_nearest(sample.value)
-            boundary, surface_point = self._field.boundary, self.backend.Array3f(dr.nan)
+            boundary, surface_point = self.surface.field.boundary, self.backend.Array3f(dr.nan)
             if boundary is not None and boundary.closest_point is not None:
                 surface_point = boundary.closest_point(p)
             surface_point = dr.select(residual == 0, p, surface_point)
             lower = self.backend.Float(0)
             if sample.all_promises:
                 lower = level_distance_lower_bound(
-                    self.backend, self._field, self.levels, p, sample
+                    self.backend, self._evaluator, self.levels, p, sample
                 )
             return (
                 p,
@@ -523,7 +522,7 @@ class _QueryEvaluator:
 
         points: (n, 3) the queries.
         """
-        jumps, tracer = self._tracer.field.jumps, self._tracer
+        jumps, tracer = self._tracer.evaluator.jumps, self._tracer
         mesh = jumps.mesh()
         closest = np.full_like(points, np.nan)
         if mesh is None or not len(points):
@@ -557,7 +556,7 @@ class _QueryEvaluator:
     def distance_to_jumps(self, points: FloatArray) -> FloatArray:
         """Return the distances (n,) of points (n, 3) from the facets across which f jumps, whether
         these are part of the surface or not."""
-        jumps = self._tracer.field.jumps
+        jumps = self._tracer.evaluator.jumps
 
         def compute(p: Vec3) -> tuple[Real]:
             return (jumps.distance(p),)
@@ -610,7 +609,7 @@ class _QueryEvaluator:
             this radius about the closest point, no point of the surface is nearer to the query; 0
             if that is not proved.
         """
-        if self.surface.field.jumps is not None:
+        if self.surface.field.has_jumps:
 
             def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)
@@ -674,7 +673,7 @@ class _QueryEvaluator:
             the boundary curve, in the direction of the query p. (A length comes as a vector of
             three equal components, since `in_batches` takes vectors only.)"""
             to_query = p - b
-            sample = self._field.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
+            sample = self._evaluator.evaluate(b + lengths.x / safe_norm(to_query) * to_query)
             return (
                 first_order_distance(self.levels.offset_to_nearest(sample.value), sample.gradient),
             )
@@ -825,7 +824,7 @@ class _QueryEvaluator:
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
             """Return the exact function minus the approximate one at y: the difference of the
             values (as a vector of equal components), and that of the gradients."""
-            full, sample = exact.field.evaluate(y), approximate.field.evaluate(y)
+            full, sample = exact.evaluator.evaluate(y), approximate.evaluator.evaluate(y)
             vector = self.backend.Array3f
             return vector(full.value - sample.value), vector(full.gradient) - vector(
                 sample.gradient
@@ -835,8 +834,8 @@ class _QueryEvaluator:
             """Return the closest point to p, as a tuple of one, by Newton's method from y; NaN if
             it does not converge. The level set is that of the approximate function plus the linear
             function that has at y the value value.x and the gradient `gradient`."""
-            field = _LinearlyShiftedField(approximate.field, y, value.x, gradient)
-            descent = replace(approximate, field=field)
+            evaluator = _LinearlyShifted(approximate.evaluator, y, value.x, gradient)
+            descent = replace(approximate, evaluator=evaluator)
             end, _, is_lost, _ = descent.newton(p, y, self.backend.Float(dr.inf))
             nearest, is_found, _ = descent.finish(p, end)
             return (dr.select(is_found & ~is_lost, nearest, dr.nan),)
@@ -871,8 +870,8 @@ class _QueryEvaluator:
         return in_batches(self.backend, compute, points)[0]
 
 
-class _LinearlyShiftedField(Field):
-    """The sum of a field and of the linear function value + slope . (p - anchor) of the point p.
+class _LinearlyShifted(Evaluator):
+    """The sum of a function and of the linear function value + slope . (p - anchor) of the point p.
     Each lane has a linear function of its own.
 
     The linear function corrects the truncation error that the field has at the anchor, and the
@@ -880,14 +879,14 @@ class _LinearlyShiftedField(Field):
     that the sum states is the rounding error of the field alone.
     """
 
-    def __init__(self, field: Field, anchor: Vec3, value: Real, slope: Vec3) -> None:
-        self._field, self._anchor, self._offset, self._slope = field, anchor, value, slope
+    def __init__(self, evaluator: Evaluator, anchor: Vec3, value: Real, slope: Vec3) -> None:
+        self._evaluator, self._anchor, self._offset, self._slope = evaluator, anchor, value, slope
 
     def evaluate(self, p: Vec3) -> Sample:
         """Return the sample of the sum at p. The value error of the field's sample is the sum of
         its rounding error and its truncation error. In the result it is the rounding error alone:
         the linear function corrects the truncation error."""
-        sample = self._field.evaluate(p)
+        sample = self._evaluator.evaluate(p)
         shifted = sample.shifted(dr.dot(self._slope, p - self._anchor) + self._offset)
         return replace(
             shifted,
@@ -899,7 +898,7 @@ class _LinearlyShiftedField(Field):
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """Return the rows of the Hessian of the field at p. The linear function does not change
         it, since its second derivatives are 0."""
-        return self._field.hessian(p)
+        return self._evaluator.hessian(p)
 
 
 def _length(vectors: FloatArray) -> FloatArray:

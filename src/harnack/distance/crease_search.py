@@ -25,7 +25,7 @@ from harnack.distance.tangent_plane import in_batches
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.enclosures import Levels
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
     from harnack.geometry import Volume
 
 __all__ = ["MAX_OPERANDS", "CreaseSearch", "OperandDescent"]
@@ -39,11 +39,11 @@ _LEVEL_ROUNDING = 256.0
 
 class OperandDescent(Protocol):
     """Interface of the descents along the surface of one operand alone. (The two attributes and the
-    method are those of the search's evaluator of that operand.)"""
+    method are those of the search for points of that operand.)"""
 
     @property
-    def prepared(self) -> Field:
-        """The function of the operand, prepared for the backend."""
+    def evaluator(self) -> Evaluator:
+        """The evaluator of the operand's function."""
         ...
 
     def descend(
@@ -59,20 +59,20 @@ class _OtherOperands:
     """The surfaces of all operands but one, with the interface of a volume that they bound: at a
     point the operand counts whose surface is nearest to first order.
 
-    fields: the functions of these operands, prepared for the backend.
+    evaluators: the evaluators of these operands' functions.
     levels: the values of the functions on the surface.
     """
 
     backend: Backend
-    fields: tuple[Field, ...]
+    evaluators: tuple[Evaluator, ...]
     levels: Levels
 
     def _nearest(self, p: Vec3) -> tuple[Real, Vec3]:
         """Return the first-order signed distance of p from the nearest of the surfaces, positive
         where the function is above the level; and the unit normal of that surface."""
         distance, normal = self.backend.Float(dr.inf), self.backend.Array3f(0)
-        for field in self.fields:
-            sample = field.evaluate(p)
+        for evaluator in self.evaluators:
+            sample = evaluator.evaluate(p)
             norm = safe_norm(sample.gradient)
             trial = -self.levels.offset_to_nearest(sample.value) / norm
             is_nearer = dr.abs(trial) < dr.abs(distance)
@@ -93,13 +93,13 @@ class _OtherOperands:
 class CreaseSearch:
     """Searches for nearer points of the surface of a combination of solids.
 
-    field: the function f of the combination, prepared for the backend.
+    evaluator: samples the function f of the combination.
     levels: the values of f on the surface.
     operands: the descents along the surface of each operand alone.
     """
 
     backend: Backend
-    field: Field
+    evaluator: Evaluator
     levels: Levels
     operands: tuple[OperandDescent, ...]
 
@@ -116,12 +116,12 @@ class CreaseSearch:
         feet = [o.descend(points, points, unlimited)[0] for o in self.operands]
         for foot in feet:
             self._update(points, best, foot)
-        prepared = [operand.prepared for operand in self.operands]
-        for number, (field, foot) in enumerate(zip(prepared, feet, strict=True)):
-            others = tuple(prepared[:number] + prepared[number + 1 :])
+        evaluators = [operand.evaluator for operand in self.operands]
+        for number, (evaluator, foot) in enumerate(zip(evaluators, feet, strict=True)):
+            others = tuple(evaluators[:number] + evaluators[number + 1 :])
             # It has the two methods of a volume that the descent calls.
             boundary = cast("Volume", _OtherOperands(self.backend, others, self.levels))
-            crease = ClipCurveDescent(self.backend, field, self.levels, boundary)
+            crease = ClipCurveDescent(self.backend, evaluator, self.levels, boundary)
             for start in (best.copy(), foot):
                 self._update(points, best, self._on_crease(crease, points, start))
         return best
@@ -160,7 +160,7 @@ class CreaseSearch:
 
         def compute(p: Vec3) -> tuple[Real]:
             """Return 1 where f has a level at p, else 0, as a tuple."""
-            sample = self.field.evaluate(p)
+            sample = self.evaluator.evaluate(p)
             rounding = _LEVEL_ROUNDING * self.backend.machine_epsilon * max_norm(p)
             allowed = dr.fma(rounding, safe_norm(sample.gradient), 2 * sample.value_error)
             is_on = dr.abs(self.levels.offset_to_nearest(sample.value)) <= allowed

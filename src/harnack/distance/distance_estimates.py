@@ -21,6 +21,7 @@ from harnack.distance.closest_point_search import ClosestPoints, find_closest
 from harnack.distance.tangent_plane import first_order_distance, in_batches, second_order_distance
 from harnack.enclosures import Levels
 from harnack.fields.clearance import level_distance_lower_bound
+from harnack.fields.evaluator import Evaluator
 from harnack.fields.field import Field
 from harnack.name_suggestions import did_you_mean, is_one_of, with_article
 from harnack.progress import ProgressFunction, show_progress
@@ -107,18 +108,18 @@ def signed_distance(
         return _outwards(field) * np.copysign(closest.distance, closest.signed_value)
     if traced.clip_volume is not None and method != "lower_bound":
         raise TypeError(f'method="{method}" does not see clip and section: use "closest_point"')
-    levels, prepared = traced.target_levels(backend), traced.evaluator(backend)
+    levels, evaluator = traced.target_levels(backend), traced.evaluator(backend)
     compute = _COMPUTE[method]
 
     def estimate(p: Vec3) -> tuple[Real | Vec3, ...]:
         """Return two results for p: the point as rounded, and the estimate or bound of its distance
         by the chosen method."""
-        return p, compute(backend, prepared, levels, p)
+        return p, compute(backend, evaluator, levels, p)
 
     x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
-    if field.jumps is not None and method != "lower_bound":
+    if field.has_jumps and method != "lower_bound":
         # These methods do not see facets: the nearest one of the surface is searched for. (The
         # lambda shows no progress.)
         jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
@@ -232,7 +233,7 @@ def _find(
     Raises NotImplementedError for a clip or section of a field with jumps.
     """
     if surface.clip_volume is not None:
-        if surface.field.jumps is not None:
+        if surface.field.has_jumps:
             raise NotImplementedError(
                 f"{name} takes no clip and no section of "
                 f"{with_article(type(surface.field).__name__)}, which jumps: cut its mesh "
@@ -268,16 +269,17 @@ def _surface(
     """
     target, choices = surface_and_options(verb, surface, options, keywords, _HONORED)
     field = target.field
-    if field.jumps is not None and not field.jumps.gives_distances:
-        raise NotImplementedError(
-            f"{type(field).__name__} has jumps but does not say how far they are: define the "
-            f"method distance(p) of its {type(field.jumps).__name__}"
-        )
     # (An over-relaxation of 1: rays take proved steps only.)
     closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
-    return TracedSurface.of(target, closely).with_call_cache(), choose_backend(
-        choices.precision or "double"
-    )
+    traced = TracedSurface.of(target, closely).with_call_cache()
+    backend = choose_backend(choices.precision or "double")
+    jumps = traced.evaluator(backend).jumps if field.has_jumps else None
+    if jumps is not None and not jumps.gives_distances:
+        raise NotImplementedError(
+            f"{type(field).__name__} has jumps but does not say how far they are: define the "
+            f"method distance(p) of its {type(jumps).__name__}"
+        )
+    return traced, backend
 
 
 def _warn_of_failures(name: str, result: ClosestPoints) -> None:
@@ -320,28 +322,28 @@ def _check_domain(field: Field, points: FloatArray) -> None:
         )
 
 
-def _first_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _first_order(backend: Backend, evaluator: Evaluator, levels: Levels, p: Vec3) -> Real:
     """Return the first-order estimate (f - level)/|grad f| of the signed distance of p from the
     level set, for the level nearest in value. `backend` is not used."""
     del backend
-    sample = field.evaluate(p)
+    sample = evaluator.evaluate(p)
     return first_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient)
 
 
-def _second_order(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _second_order(backend: Backend, evaluator: Evaluator, levels: Levels, p: Vec3) -> Real:
     """Return the second-order estimate of the signed distance of p from the level set, with the
     sign of f - level, for the level nearest in value. `backend` is not used."""
     del backend
-    sample, rows = field.evaluate(p), field.hessian(p)
+    sample, rows = evaluator.evaluate(p), evaluator.hessian(p)
     return second_order_distance(-levels.offset_to_nearest(sample.value), sample.gradient, rows)
 
 
-def _signed_lower_bound(backend: Backend, field: Field, levels: Levels, p: Vec3) -> Real:
+def _signed_lower_bound(backend: Backend, evaluator: Evaluator, levels: Levels, p: Vec3) -> Real:
     """Return the proved lower bound of the distance of p from the level sets of all levels, with
     the sign of f - level for the level nearest in value."""
-    sample = field.evaluate(p)
+    sample = evaluator.evaluate(p)
     residual = -levels.offset_to_nearest(sample.value)
-    return dr.copysign(level_distance_lower_bound(backend, field, levels, p, sample), residual)
+    return dr.copysign(level_distance_lower_bound(backend, evaluator, levels, p, sample), residual)
 
 
 _COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {

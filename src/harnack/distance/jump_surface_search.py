@@ -224,7 +224,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
     gradient is used, because it is unbounded near the edge of a jump surface.
     """
     backend, jumps = surface.backend, _jumps_of(surface)
-    field = exactly_sampled(surface.field, backend)
+    evaluator = exactly_sampled(surface.evaluator, backend)
     real, index, vector = backend.Float, backend.UInt32, backend.Array3f
     zero = vector(0)
 
@@ -242,7 +242,7 @@ def straddles_level(surface: SurfaceTracer, y: Vec3, radius: Real, active: Mask)
         t = real(jumps.next_crossing(o, direction, start_crossing, edge_length, active).t)
         before_jump = dr.select(t < edge_length, t, 0.5 * edge_length)
         for distance in (real(0), _FRACTION_TO_FACET * before_jump):
-            value = real(field.evaluate(dr.fma(vector(distance), direction, o)).value)
+            value = real(evaluator.evaluate(dr.fma(vector(distance), direction, o)).value)
             lower, upper = fmin(lower, value), fmax(upper, value)
         return k + 1, lower, upper, active & (k + 1 < len(_EDGES))
 
@@ -261,9 +261,9 @@ def _jumps_of(surface: SurfaceTracer) -> Jumps:
     Raises:
         TypeError: f does not jump.
     """
-    if surface.field.jumps is None:
+    if surface.evaluator.jumps is None:
         raise TypeError(f"{with_article(type(surface.field).__name__)} does not jump")
-    return surface.field.jumps
+    return surface.evaluator.jumps
 
 
 def _parts(facet: NearestFacet) -> tuple[Any, ...]:

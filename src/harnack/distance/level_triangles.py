@@ -59,7 +59,7 @@ class LevelTriangles:
     is_complete: bool
 
     @classmethod
-    def of(cls, surface: TracedSurface) -> LevelTriangles | None:
+    def of(cls, surface: TracedSurface, backend: Backend) -> LevelTriangles | None:
         """Return the triangles of which a surface consists, wholly or in part. The surface is the
         boundary of a `MeshSolid`, or a level set of the winding number of a mesh, without clip and
         domain; for other surfaces the result is None.
@@ -74,7 +74,7 @@ class LevelTriangles:
             solid = surface.field.surface
             # True: the surface consists of these triangles only.
             return cls(solid.corners, solid.center, solid.size, True)
-        jumps = surface.field.jumps
+        jumps = surface.evaluator(backend).jumps
         mesh = None if jumps is None else jumps.mesh()
         if (
             jumps is None
@@ -154,15 +154,16 @@ def _proved_on_level(surface: TracedSurface, corners: FloatArray, size: float) -
     either side of the triangle, f stays on the side of the level on which it is beside the center.
     """
     backend, field = choose_backend("double"), surface.field
-    prepared = surface.evaluator(backend)
+    evaluator = surface.evaluator(backend)
     # The same samples, and levels with the period 1: those of f modulo 1.
-    smooth_field = EvaluateOnly(prepared.evaluate)
+    smooth = EvaluateOnly(evaluator.evaluate)
     levels = Levels(tuple(dr.opaque(backend.Float, level) for level in surface.level_values), 1.0)
 
     def clearance(p: Vec3) -> tuple[Any]:
         """Return the radius, as a tuple of one, of the ball about p in which f modulo 1 is proved
         not to take the level."""
-        return (level_distance_lower_bound(backend, smooth_field, levels, p, prepared.evaluate(p)),)
+        sample = evaluator.evaluate(p)
+        return (level_distance_lower_bound(backend, smooth, levels, p, sample),)
 
     center = corners.mean(axis=1)
     (clearances,) = in_batches(backend, clearance, center)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from harnack.backend import Backend, Mask, Real, Vec3
+    from harnack.fields.evaluator import Evaluator
     from harnack.fields.field import Field
     from harnack.geometry import Volume
     from harnack.tracer import Surface, TraceKeywords, TraceOptions
@@ -58,8 +59,8 @@ class CurvatureSamples:
     normal: (n, 3) grad f/|grad f|.
     mean_error, gaussian_error: (n,) proved bounds of how far `mean` and `gaussian` may be off;
         infinite where they are NaN, and where the field does not state the errors of its
-        derivatives (`Field.derivative_errors`). The rounding of the coordinates in which a moved or
-        bent field without a formula is evaluated is not included.
+        derivatives (`Evaluator.derivative_errors`). The rounding of the coordinates in which a
+        moved or bent field without a formula is evaluated is not included.
     """
 
     mean: FloatArray
@@ -112,7 +113,7 @@ def curvature(
     # Most fields are evaluated inside a kernel. A `BatchedField` is evaluated by tree sums, for
     # many points at once.
     if not isinstance(field, BatchedField):
-        prepared = field.prepare(backend)
+        evaluator = field.evaluator(backend)
 
         def from_field(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
             """Return the curvatures at p, from the gradient and Hessian that the field computes
@@ -122,9 +123,9 @@ def curvature(
                 the error.
             """
             refined = (
-                prepared
-                if prepared.variable_accuracy is None
-                else prepared.variable_accuracy.at(acceptance)
+                evaluator
+                if evaluator.variable_accuracy is None
+                else evaluator.variable_accuracy.at(acceptance)
             )
             sample = refined.evaluate(p)
             errors = refined.derivative_errors(p, sample)
@@ -132,7 +133,7 @@ def curvature(
             return _Derivatives(backend, sample.gradient, rows, *errors).curvatures()
 
         return _refine_accuracy(
-            backend, field, from_field, points, prepared.variable_accuracy is not None
+            backend, field, from_field, points, evaluator.variable_accuracy is not None
         )
 
     def from_tree(p: Vec3, acceptance: Real) -> tuple[Real | Vec3, ...]:
@@ -397,7 +398,7 @@ def curvature_lines(
         dr.opaque(backend.Float, name) for name in (levels[0], step, largest)
     )
     tracer = _CurvatureLineTracer(
-        backend, field.prepare(backend), level, opaque_step, largest_factor
+        backend, field.evaluator(backend), field.period, level, opaque_step, largest_factor
     )
     with dr.suspend_grad():
         halves = tracer.follow(start, count)
@@ -430,6 +431,8 @@ class _CurvatureLineTracer:
     surface bends most, or least. Their tangents are the principal directions, the directions of the
     larger or of the smaller principal curvature.
 
+    evaluator: samples f.
+    period: the period of f; None if f is real-valued.
     level: the value of f on the surface.
     step: the arc length of a step.
     largest: 1 for the lines along the direction of the larger principal curvature, 0 for those
@@ -437,7 +440,8 @@ class _CurvatureLineTracer:
     """
 
     backend: Backend
-    field: Field
+    evaluator: Evaluator
+    period: float | None
     level: Real
     step: Real
     largest: Real
@@ -511,8 +515,8 @@ class _CurvatureLineTracer:
         previous: the line's direction before. Of the two opposite directions the result is the one
             that makes an angle of at most 90 degrees with it. None: either of the two.
         """
-        plane = TangentPlane.of(self.field.evaluate(x).gradient)
-        eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.field.hessian(x)))
+        plane = TangentPlane.of(self.evaluator.evaluate(x).gradient)
+        eigen = SymmetricEigen2.of(*plane.restrict_hessian(self.evaluator.hessian(x)))
         # The eigenvector of the larger eigenvalue if `largest` is 1, of the smaller one if 0.
         u, v = eigen.combination(self.largest, 1 - self.largest)
         direction = u * plane.u + v * plane.v
@@ -533,11 +537,11 @@ class _CurvatureLineTracer:
 
         def step(x: Vec3) -> Vec3:
             """Make one Newton step from x."""
-            sample = self.field.evaluate(x)
+            sample = self.evaluator.evaluate(x)
             gap = sample.value - self.level
             # Of a periodic function, the level that is nearest in value counts.
-            if self.field.period is not None:
-                gap = gap - self.field.period * dr.round(gap / self.field.period)
+            if self.period is not None:
+                gap = gap - self.period * dr.round(gap / self.period)
             return x - gap / dr.squared_norm(sample.gradient) * sample.gradient
 
         return _iterate(step, x, steps, self.backend)

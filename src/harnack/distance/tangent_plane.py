@@ -18,7 +18,7 @@ from harnack.fields import batch_evaluation as field_points
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
 
 __all__ = [
     "SymmetricEigen2",
@@ -100,10 +100,10 @@ class SymmetricEigen2:
         )
 
 
-def has_hessian(backend: Backend, field: Field) -> bool:
-    """Return whether a field, prepared for the backend, can compute its second derivatives."""
+def has_hessian(backend: Backend, evaluator: Evaluator) -> bool:
+    """Return whether an evaluator can compute second derivatives."""
     try:
-        field.hessian(backend.Array3f(0))
+        evaluator.hessian(backend.Array3f(0))
     except NotImplementedError:
         return False
     return True

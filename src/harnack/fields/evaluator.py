@@ -165,4 +165,3 @@ class EvaluateOnly(Evaluator):
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._evaluate(p)
-

@@ -580,8 +580,10 @@ def _ready_in(value: Any, backend: Backend) -> Any:
 
 def _ready(field: Field, backend: Backend) -> Field:
     """A copy of a field whose method `evaluate` is that of its evaluator on a backend."""
-    other = copy.copy(field)
-    object.__setattr__(other, "evaluate", field.evaluator(backend).evaluate)
+    other, evaluator = copy.copy(field), field.evaluator(backend)
+    object.__setattr__(other, "evaluate", evaluator.evaluate)
+    # The WebGPU recorder finds arrays through attributes, and a method has none.
+    object.__setattr__(other, "_evaluator", evaluator)
     return other
 
 

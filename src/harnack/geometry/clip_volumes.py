@@ -171,7 +171,7 @@ class Polytope(Volume):
     def planes(self) -> FloatArray:
         """The planes as rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
-    def prepare(self: Prepared, backend: Backend) -> Prepared:
+    def upload(self: Prepared, backend: Backend) -> Prepared:
         """An equal polytope whose planes are in a buffer on the backend."""
         return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
@@ -332,7 +332,7 @@ class Ball(Volume):
             return self._device_numbers
         return backend.Array3f(*self.center), backend.Float(self.radius)
 
-    def prepare(self, backend: Backend) -> Ball:
+    def upload(self, backend: Backend) -> Ball:
         """An equal ball whose center and radius are kernel parameters."""
         center = backend.Array3f(*(dr.opaque(backend.Float, c) for c in self.center))
         return replace(self, _device_numbers=(center, dr.opaque(backend.Float, self.radius)))
@@ -504,8 +504,8 @@ class VolumeIntersection(Volume):
             check_volume(cast("Any", member) or "none", "each part of an intersection")
         object.__setattr__(self, "volumes", members)
 
-    def prepare(self, backend: Backend) -> VolumeIntersection:
-        return VolumeIntersection(v.prepare(backend) for v in self.volumes)
+    def upload(self, backend: Backend) -> VolumeIntersection:
+        return VolumeIntersection(v.upload(backend) for v in self.volumes)
 
     def clip(self, o: Vec3, d: Vec3, t_min: Real, t_max: Real) -> tuple[Real, Real]:
         """The interval [t0, t1] of each ray o + t d within all volumes, for t_min <= t <= t_max.

@@ -91,7 +91,7 @@ class Volume(abc.ABC):
     def padded(self, distance: float) -> Volume:
         """A volume that contains every point within `distance` (>= 0, finite) of this volume."""
 
-    def prepare(self, backend: Backend) -> Volume:
+    def upload(self, backend: Backend) -> Volume:
         """An equal volume whose numbers are kernel parameters on the backend. So no other kernel
         has to be compiled for another volume of the same kind."""
         del backend

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -81,12 +82,14 @@ class _PreviewCache:
     drawn: the surfaces as objects of the studio.
     prepared: the surfaces on the stage, with their colors.
     rays: the number of rays that were traced through them so far.
+    prepared_rays: the number of rays for which they were prepared.
     """
 
     key: Any
     drawn: list[StudioObject]
     prepared: list[PreviewSurface] = field(default_factory=list[PreviewSurface])
     rays: int = 0
+    prepared_rays: int = 0
 
 
 class MessageHandler:
@@ -358,10 +361,10 @@ class Session:
 
         rays: the number of rays of the next picture.
 
-        The surfaces of the last call are returned again if the controls are the same. But once so
-        many rays were traced that building cells takes less time than it saves, the surfaces are
-        prepared again, with cells. These hold local expansions of the field, which make each ray
-        faster.
+        The surfaces of the last call are returned again if the controls are the same. But once ten
+        times as many rays were traced as they were prepared for, the surfaces are prepared again:
+        then building cells may take less time than it saves. Cells hold local expansions of the
+        field, which make each ray faster.
         """
         # Arrays are compared by their bytes.
         loops = None if controls.curves is None else [loop.tobytes() for loop in controls.curves]
@@ -370,16 +373,15 @@ class Session:
         if state is None or state.key != key:
             state = self._painted = _PreviewCache(key, self.live.surfaces_at(controls))
         state.rays += rays
-        drawn = [replace(body, surface=body.surface.for_rays(state.rays)) for body in state.drawn]
-        pairs = zip(drawn, state.drawn, strict=True)
-        # `for_rays` returns another field once cells take less time than they save.
-        if not state.prepared or any(
-            prepared_body.surface.field is not old_body.surface.field
-            for prepared_body, old_body in pairs
-        ):
-            state.drawn = drawn
+        # Powers of ten: so surfaces are seldom prepared again.
+        rays = 10 ** int(math.log10(max(state.rays, 1)))
+        if not state.prepared or rays != state.prepared_rays:
+            state.prepared_rays = rays
+            state.drawn = [
+                replace(body, surface=body.surface.for_rays(rays)) for body in state.drawn
+            ]
             state.prepared = [
-                PreviewSurface(self.live.place(body), surface_colors(body)) for body in drawn
+                PreviewSurface(self.live.place(body), surface_colors(body)) for body in state.drawn
             ]
         return state.prepared
 

@@ -81,7 +81,7 @@ class LevelSamples:
 @dataclass
 class LevelFunction:
     """The function f - level of a field f, evaluated in double precision at arrays of points.
-    `evaluations` counts these points. `_prepared` is the field as it is evaluated on the device
+    `evaluations` counts these points. `_evaluator` samples the field on the device
     (`_backend`), and `_levels` holds the level there.
 
     most_faces: the largest allowed number of triangles of the level set's mesh.
@@ -100,8 +100,8 @@ class LevelFunction:
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
-        self._prepared = self.uploads.get_or_make(
-            self.field, "evaluator", lambda: self.field.prepare(self._backend)
+        self._evaluator = self.uploads.get_or_make(
+            self.field, "evaluator", lambda: self.field.evaluator(self._backend)
         )
         # Opaque numbers are data of kernels, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)
@@ -131,7 +131,7 @@ class LevelFunction:
         def value(p: Vec3) -> tuple[Real]:
             """The value of f at the points p, as a tuple of one."""
             with share_samples(), without_alternatives():
-                return (self._prepared.evaluate(p).value,)
+                return (self._evaluator.evaluate(p).value,)
 
         return self.relative_to_level(self._in_batches(points, value)[0])
 
@@ -142,7 +142,7 @@ class LevelFunction:
         def value_and_error(p: Vec3) -> tuple[Real, Real]:
             """Two results for the points p: the value of f, and a bound of its error."""
             with without_alternatives():
-                sample = self._prepared.evaluate(p)
+                sample = self._evaluator.evaluate(p)
             return sample.value, self._backend.Float(sample.value_error)
 
         value, error = self._in_batches(points, value_and_error)
@@ -162,8 +162,8 @@ class LevelFunction:
         def compute(p: Vec3, r: Vec3) -> tuple[Real, Vec3, Real]:
             """The value and the gradient of f at the points p, and the bound of the gradient's
             change within the distance r.x of p."""
-            sample = self._prepared.evaluate(p)
-            change = self._prepared.gradient_change_bound(p, r.x) + sample.gradient_error
+            sample = self._evaluator.evaluate(p)
+            change = self._evaluator.gradient_change_bound(p, r.x) + sample.gradient_error
             return sample.value, sample.gradient, change
 
         # Each point counts twice: for the sample and for the bound.
@@ -181,9 +181,9 @@ class LevelFunction:
         def bound(p: Vec3) -> tuple[Real]:
             """The lower bound of the distance from the points p to the level set, as a tuple of
             one."""
-            sample = self._prepared.evaluate(p)
+            sample = self._evaluator.evaluate(p)
             return (
-                level_distance_lower_bound(self._backend, self._prepared, self._levels, p, sample),
+                level_distance_lower_bound(self._backend, self._evaluator, self._levels, p, sample),
             )
 
         return self._in_batches(points, bound)[0]
@@ -196,10 +196,10 @@ class LevelFunction:
         radius, rounding errors included. Otherwise the radius is 0."""
         if self.period is None:
             with share_samples(), without_alternatives():
-                sample = self._prepared.evaluate(p)
+                sample = self._evaluator.evaluate(p)
             return sample.value, sample.gradient, self._backend.Float(0)
         with share_samples():
-            sample = self._prepared.evaluate(p)
+            sample = self._evaluator.evaluate(p)
         max_slope = safe_norm(sample.gradient) + sample.gradient_error
         # The slope of f along any direction is at most the length of the gradient.
         slopes = SlopeRange(-max_slope, max_slope)

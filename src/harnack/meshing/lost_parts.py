@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray
+from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend
 from harnack.fields.blobs.blobs import Blobs
 from harnack.fields.blobs.hrbf import HRBF
 from harnack.fields.solid_angles.dipole import DipolePotential
@@ -79,7 +79,7 @@ class PointsOnLevel:
 
         tolerance: a length. The sign of a cloud's field is evaluated at least this far from its
             points."""
-        jumps = function.field.jumps
+        jumps = function.field.evaluator(choose_backend("double")).jumps
         # The vertices of the mesh, its faces, and more.
         mesh = None if jumps is None else jumps.mesh()
         if mesh is not None:

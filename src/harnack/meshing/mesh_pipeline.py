@@ -420,7 +420,7 @@ def _mesh_from_signs(
             solid_so_far = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
             solid_so_far = solid_so_far - to_manifold(signed(ends[1], -1.0, True))
-        if field.jumps is not None and len(levels) == 2:
+        if field.has_jumps and len(levels) == 2:
             _check_has_thickness(field, solid_so_far, ends, mesh_options.tolerance.at(size))
         cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         solid_so_far ^= volume_manifold(
@@ -459,7 +459,7 @@ def _ends_by_signs(
         TypeError: the level set is to be thickened, but f jumps across it.
         ValueError: the field has no such level.
     """
-    if is_thick and field.jumps is not None:
+    if is_thick and field.has_jumps:
         raise TypeError(
             f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
             "along: mesh it, and move the mesh's vertices instead"
@@ -655,7 +655,7 @@ def _checked(field: Field) -> Field:
             `SolidAngle`.
     """
     check_is_field(field)
-    if field.patches is not None or (field.jumps is not None and not uses_sign_meshing(field)):
+    if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"

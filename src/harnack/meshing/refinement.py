@@ -132,7 +132,7 @@ def refine(
         )
         smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
         faces = np.concatenate([smaller_faces, fan_faces(faces[is_fan], fan_centers)])
-    if function.field.variable_accuracy is not None:
+    if function.field.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
 

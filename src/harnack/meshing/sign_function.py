@@ -164,18 +164,18 @@ class SignFunction(LevelFunction):
         gradients are set to 0, since they tell nothing about the distance to the level set. Radii
         (`quarter_period_radius`) are 0."""
         no_radius = np.zeros(len(points))
-        if self.field.jumps is not None:
+        if self.field.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), no_radius)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
             value, gradient = self.field.rough_value_and_gradient(points, precision=self.precision)
         else:
             backend = choose_backend(self.precision)
-            prepared = self.field.prepare(backend)
+            evaluator = self.field.evaluator(backend)
 
             def value_and_gradient(p: Vec3) -> tuple[Real, Vec3]:
                 """Two results for the points p: the value and the gradient of the field."""
-                sample = prepared.evaluate(p)
+                sample = evaluator.evaluate(p)
                 return sample.value, sample.gradient
 
             value, gradient = map_batches(backend, value_and_gradient, points)
@@ -227,7 +227,7 @@ class SignFunction(LevelFunction):
         direction = high - low
         t = np.zeros(len(low))
         normal, is_on_jump = np.zeros_like(low), np.zeros(len(low), np.bool_)
-        if self.field.jumps is not None:
+        if self.field.has_jumps:
             # Halve the segments until few facets are left on them, and then intersect them with
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
@@ -253,7 +253,7 @@ class SignFunction(LevelFunction):
         if not len(x):
             return x
         self.evaluations += len(x)
-        if isinstance(self.field, BatchedField) and self.field.jumps is None:
+        if isinstance(self.field, BatchedField) and not self.field.has_jumps:
             # [1]: the gradient.
             field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:
@@ -329,7 +329,7 @@ class SignFunction(LevelFunction):
             there is no crossing; and the mask (n,) of segments that cross one.
         """
         backend = choose_backend("double")
-        jumps = self.field.prepare(backend).jumps
+        jumps = self.field.evaluator(backend).jumps
         assert jumps is not None
         length = row_norms(direction)
         ray = direction / np.maximum(length, 1e-300)[:, None]
@@ -412,18 +412,19 @@ def _clearances(
     def bound(smooth: Field) -> Callable[[FloatArray], FloatArray]:
         """Make a function of points (n, 3) that returns lower bounds (n,) of the distance to the
         level set of `smooth`, a field without jumps."""
-        prepared = smooth.prepare(backend)
+        evaluator = smooth.evaluator(backend)
         levels = Levels((dr.opaque(backend.Float, level),), smooth.period)
 
         def kernel(p: Vec3) -> tuple[Real]:
             """The lower bound of the distance from p to the level set, as a tuple of one."""
-            return (level_distance_lower_bound(backend, prepared, levels, p, prepared.evaluate(p)),)
+            sample = evaluator.evaluate(p)
+            return (level_distance_lower_bound(backend, evaluator, levels, p, sample),)
 
         return lambda points: _evaluate_in_batches(backend, kernel, points)
 
     if not isinstance(field, WindingNumber):
         return [bound(field)]
-    jumps = field.prepare(backend).jumps
+    jumps = field.evaluator(backend).jumps
     assert jumps is not None
 
     def distance(p: Vec3) -> tuple[Real]:

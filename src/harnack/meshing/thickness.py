@@ -246,7 +246,7 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
 def _is_within(solid: MeshSolid, points: FloatArray) -> BoolArray:
     """(k,) whether points (k, 3) are inside of the solid."""
     backend = choose_backend("double")
-    value = solid.prepare(backend).evaluate(to_vector3(backend, points)).value
+    value = solid.evaluator(backend).evaluate(to_vector3(backend, points)).value
     return np.asarray(to_numpy(value) < 0)
 
 
@@ -258,7 +258,7 @@ def _nearest(solid: MeshSolid, points: FloatArray) -> tuple[FloatArray, FloatArr
         3) towards them.
     """
     backend = choose_backend("double")
-    sample = solid.prepare(backend).evaluate(to_vector3(backend, points))
+    sample = solid.evaluator(backend).evaluate(to_vector3(backend, points))
     value, gradient = to_numpy(sample.value), to_numpy(sample.gradient)
     # The value is the signed distance, negative inside; the gradient points to the surface.
     distance = np.abs(value)

@@ -41,6 +41,7 @@ from harnack.rendering.scales import Color, parse_color
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
+    from harnack.fields import Evaluator
     from harnack.geometry import Volume
 
 # A surface that is cut by the function's own domain reaches beyond it by rounding, at most by this
@@ -65,7 +66,7 @@ def as_field(function: Any, name: str = "color_by") -> Field:
         except ValueError as error:  # the name may end with a comma, which suits other messages
             raise ValueError(f"{name.rstrip(',')}: {error}") from None
     if isinstance(function, Field):
-        if function.patches is not None:
+        if function.has_patches:
             raise ValueError(
                 f"{name} must be one function on space, and this {type(function).__name__} has one "
                 "for each part"
@@ -170,7 +171,7 @@ class Isolines:
             )
         return period / line_count
 
-    def prepare(self, backend: Backend, size: float) -> PreparedIsolines:
+    def upload(self, backend: Backend, size: float) -> PreparedIsolines:
         """Return the isolines with their numbers uploaded to a backend (the device that traces
         rays).
 
@@ -183,8 +184,8 @@ class Isolines:
         # g, its volume, half the width of a line, the interval or else the table of levels, and the
         # period of g; what does not exist is None.
         return PreparedIsolines(
-            self.function_field.prepare(backend),
-            None if volume is None else volume.prepare(backend),
+            self.function_field.evaluator(backend),
+            None if volume is None else volume.upload(backend),
             dr.opaque(backend.Float, 0.5 * width),
             None if step is None else dr.opaque(backend.Float, step),
             None if step is not None else upload_floats(backend, _table(self.levels, period)),
@@ -251,7 +252,7 @@ class PreparedIsolines:
     on a surface, where another function g takes given values, its levels. All numbers are kernel
     parameters, so other numbers compile no other kernel.
 
-    function: the function g.
+    function: samples the function g.
     volume: the volume in which g is defined; None for all of space.
     half_width: half the width of a line, a length.
     spacing: if the lines are at all whole multiples of a number, this number; else None.
@@ -259,7 +260,7 @@ class PreparedIsolines:
     period: the period of g if its values are angles, else None.
     """
 
-    function: Field
+    function: Evaluator
     volume: Volume | None
     half_width: Real
     spacing: Real | None

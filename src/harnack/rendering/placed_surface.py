@@ -147,11 +147,11 @@ class PlacedSurface:
         def vector(numbers: FloatArray) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
 
-        prepared = surface.prepare(backend)
+        prepared = surface.tracer(backend)
         solid = None if surface.solid_range is None else CappedSolid.of(surface, prepared)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
-        lines = tuple(isoline.prepare(backend, size) for isoline in isolines)
+        lines = tuple(isoline.upload(backend, size) for isoline in isolines)
         return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:

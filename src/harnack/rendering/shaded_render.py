@@ -96,18 +96,18 @@ def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
         ValueError: the surface consists of level sets of several functions, or its field jumps.
     """
     surface, backend = proxy.surface, mitsuba_backend(mi)
-    if surface.field.patches is not None:
+    if surface.field.has_patches:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
             'for each part. Leave antialias at "edges"'
         )
-    if surface.field.jumps is not None:
+    if surface.field.has_jumps:
         raise ValueError(
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'
         )
     # Cones need a tracer that finds where f crosses the level.
-    placed = replace(proxy.placed, prepared=surface.prepare(backend, crosses=True))
+    placed = replace(proxy.placed, prepared=surface.tracer(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 
 

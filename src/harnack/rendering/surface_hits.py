@@ -145,7 +145,7 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
     # Of a union of patches (level sets of several functions), the patch that each ray hit.
     prepared = prepared.hit_surface(trace)
-    is_hit, has_jumps = trace.status == int(RayStatus.HIT), prepared.field.jumps is not None
+    is_hit, has_jumps = trace.status == int(RayStatus.HIT), prepared.evaluator.jumps is not None
     is_smooth = is_hit & ~trace.at_jump if has_jumps else is_hit
     # The difference between the nearest level and f at the end of the march.
     value_to_level = prepared.levels.offset_to_nearest(trace.value)

@@ -84,7 +84,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     try:
         _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
-        if field.variable_accuracy is None:
+        if not field.has_variable_accuracy:
             raise
         # The Hessian may be the derivative of the exact gradient, without truncation error.
         exact_trials = [_without_truncation(field, points, entry) for entry in trials]
@@ -464,7 +464,7 @@ def _check_hessian(
     """
     backend = choose_backend("double")
     try:
-        rows = field.prepare(backend).hessian(to_vector3(backend, points, "points"))
+        rows = field.evaluator(backend).hessian(to_vector3(backend, points, "points"))
     except NotImplementedError:
         return
     n = len(points)

@@ -29,6 +29,7 @@ from harnack.enclosures import (
 from harnack.enclosures.samples import Ray
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batched_fields import BatchedField
+from harnack.fields.evaluator import Evaluator
 from harnack.fields.field import Field, check_is_field
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
@@ -148,7 +149,7 @@ def proved_free_lengths(
     )
     length = backend.Float(np.ascontiguousarray(ahead))
     below, above = (backend.Float(np.ascontiguousarray(gaps[:, k])) for k in (0, 1))
-    sample = field.prepare(backend).sample_ray(ray, backend.Float(0), length, length)
+    sample = field.evaluator(backend).sample_ray(ray, backend.Float(0), length, length)
     proofs = sample.forward if forwards else sample.backward
     # Adding 0 times an array makes one of a single number.
     steps = to_numpy(longest_free_length(proofs, LevelGaps(below, above)) + 0 * below)
@@ -258,7 +259,8 @@ def _overrides_sample_ray(field: Field) -> bool:
     """Whether the field computes the enclosures of its change along a ray by a method of its own,
     and not from its promises (proved bounds near a point) as other fields do. Fields with jumps do
     not count."""
-    return type(field).sample_ray is not Field.sample_ray and field.jumps is None
+    kind = type(field.evaluator(choose_backend("double")))
+    return kind.sample_ray not in (Evaluator.sample_ray, Field.sample_ray) and not field.has_jumps
 
 
 def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:
@@ -342,17 +344,17 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
 
 
 def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
-    """Check the field's method `differentiable_value` at points (n, 3): it has to return the value,
-    and its derivative by the automatic differentiation of Dr.Jit, in reverse mode, has to be the
-    gradient. Raises a BrokenPromiseError if not.
+    """Check the method `differentiable_value` of the field's evaluator at points (n, 3): it has to
+    return the value, and its derivative by the automatic differentiation of Dr.Jit, in reverse
+    mode, has to be the gradient. Raises a BrokenPromiseError if not.
 
     samples: the samples of the field at the points.
     """
     backend = choose_backend("double")
-    prepared = field.prepare(backend)
+    evaluator = field.evaluator(backend)
     x = to_vector3(backend, points, "points")
     dr.enable_grad(x)
-    value = prepared.differentiable_value(x)
+    value = evaluator.differentiable_value(x)
     # Differentiate the sum over all points: the derivative by each point is its own gradient.
     dr.backward(dr.sum(value), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     dr.eval(value, x.grad)

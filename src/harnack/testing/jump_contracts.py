@@ -67,7 +67,7 @@ def check_jumps(field: Field, points: FloatArray, rng: np.random.Generator) -> N
         BrokenPromiseError: naming the method that is wrong, and a point.
         TypeError: a method returns something of another type.
     """
-    jumps = field.prepare(choose_backend("double")).jumps
+    jumps = field.evaluator(choose_backend("double")).jumps
     if jumps is None:
         return
     rays = _random_rays(field, points, rng)

@@ -187,10 +187,10 @@ def accumulated_jumps(
     of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
     `Jumps.next_crossing` reports the jumps one after the other."""
     total = np.zeros_like(lengths)
-    if field.jumps is None:
+    if not field.has_jumps:
         return total
     backend = choose_backend("double")
-    jumps = field.prepare(backend).jumps
+    jumps = field.evaluator(backend).jumps
     assert jumps is not None
     o, d = to_vector3(backend, start), to_vector3(backend, direction)
     # The crossing before the first one is at the start of the ray, on no facet: with the jump 0 and
@@ -234,7 +234,7 @@ def distance_to_exit(field: Field, points: FloatArray, d: FloatArray) -> FloatAr
         return np.full(len(points), np.inf)
     backend = choose_backend("double")
     o, direction = to_vector3(backend, points, "points"), to_vector3(backend, d, "d")
-    ends = field.domain.prepare(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
+    ends = field.domain.upload(backend).clip(o, direction, backend.Float(0), backend.Float(np.inf))
     # `clip` returns where each ray is in the domain: the first and the last position.
     end = np.broadcast_to(to_numpy(ends[1]), (len(points),))
     # A little less, for rounding.
@@ -253,7 +253,7 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
     closely: whether to sample without truncation error.
     """
     backend = choose_backend(precision)
-    prepared = field.prepare(backend)
+    prepared = field.evaluator(backend)
     evaluator = exactly_sampled(prepared, backend) if closely else prepared
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
@@ -422,7 +422,7 @@ class _ViolationSearch:
         """Whether the change of f between two points has to be followed along a path between them,
         because f jumps or is known modulo a period only. Otherwise it is the difference of the
         values."""
-        return self.field.period is not None or self.field.jumps is not None
+        return self.field.period is not None or self.field.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
         """Evaluate pairs of points: make the pairs of p (n, 3) and y = p + reach * w, where reach

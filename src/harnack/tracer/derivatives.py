@@ -30,6 +30,7 @@ from harnack.backend.validation import is_plain_data
 from harnack.enclosures import Levels
 from harnack.fields.batched_fields import FieldCache
 from harnack.fields.capabilities import EXACT
+from harnack.fields.field import refuse_hidden_parameters
 from harnack.tracer.level_contact import RayStatus
 
 if TYPE_CHECKING:
@@ -60,10 +61,10 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     # Plain data has no derivatives; other attributes may hide some, which raises an error. (None:
     # the memory has a single entry for each field.)
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
-        field.refuse_hidden_parameters()
+        refuse_hidden_parameters(field)
     parameters = prepared.field.differentiable_parameters()
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
-    if field_has_derivatives and prepared.field.jumps is not None:
+    if field_has_derivatives and prepared.evaluator.jumps is not None:
         name = type(prepared.field).__name__
         raise NotImplementedError(
             f"hits of a field with jumps cannot be differentiated by its parameters: detach "
@@ -130,7 +131,7 @@ def attach_derivatives(
     """
     # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
     t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
-    if prepared.field.jumps is not None:
+    if prepared.evaluator.jumps is not None:
         t = _on_plane(prepared, o, d, end)
         is_hit &= ~end.at_jump
     backend = prepared.backend
@@ -138,13 +139,13 @@ def attach_derivatives(
         t_hit = dr.select(is_hit, t, 0)
         origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
-        accuracy = prepared.field.variable_accuracy
+        accuracy = prepared.evaluator.variable_accuracy
         if accuracy is not None:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
             # Hits are sampled without truncation; other rays do not matter (0 is the coarsest).
             scale = dr.select(is_hit, backend.Float(EXACT), 0)
-            prepared = replace(prepared, field=accuracy.at(scale))
+            prepared = replace(prepared, evaluator=accuracy.at(scale))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
             sample = prepared.sample(x)
@@ -167,7 +168,7 @@ def attach_derivatives(
     change = dr.dot(sample.gradient, point - x)
     if any(dr.grad_enabled(parameter) for parameter in prepared.field.differentiable_parameters()):
         # f depends on parameters, too: its own derivative has all of them.
-        value = prepared.field.differentiable_value(point)
+        value = prepared.evaluator.differentiable_value(point)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(prepared, sample.value)
     return dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t), normal

@@ -23,7 +23,7 @@ from harnack.enclosures.samples import value_error_bound
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Levels
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
 
 # The search distance grows by the first factor in each round, up to the second number times the
 # size of coordinates. A side of the level is sure only if f is within this fraction of the period
@@ -85,7 +85,7 @@ class _SearchState:
     active: Mask
 
 
-def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful) -> Real:
+def seen_distance(backend: Backend, evaluator: Evaluator, levels: Levels, hits: Doubtful) -> Real:
     """Return a distance from each hit within which the surface was found, at least `hits.distance`;
     inf if it was not found within a sixteenth of the size of coordinates.
 
@@ -96,7 +96,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
     hit changes sign. Secants and bisection find the point of this change, and f equals the level
     there up to its error. No sample in this precision can tell such a point from the surface.
     """
-    at_hit = field.evaluate(hits.position)
+    at_hit = evaluator.evaluate(hits.position)
     # The level nearest to f at the hit.
     level = at_hit.value + levels.offset_to_nearest(at_hit.value)
     period = levels.period
@@ -138,7 +138,7 @@ def seen_distance(backend: Backend, field: Field, levels: Levels, hits: Doubtful
         # Of the two opposite directions along an axis, the even one comes first.
         direction = dr.select((now.way & 1) == 0, direction, -direction)
         length = dr.select(now.searches, _turning_point(now), now.distance)
-        sample = field.evaluate(dr.fma(type(direction)(length), direction, hits.position))
+        sample = evaluator.evaluate(dr.fma(type(direction)(length), direction, hits.position))
         offset, error, is_sure = offset_of(sample)
         above, below = now.above | (is_sure & (offset > 0)), now.below | (is_sure & (offset < 0))
         # With the sign `side`, slopes < 0 lead towards the level.

@@ -199,7 +199,7 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """Trace rays, and return their hits as Dr.Jit arrays. The arrays carry derivatives if the rays
     were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
-    prepared = surface.for_rays(count).prepare(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.for_rays(count).tracer(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
     # The trace itself has no derivatives; they are attached to its results.
@@ -279,7 +279,7 @@ def _first_hits(
     normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     # The index of the facet or patch; -1 for none.
     index = dr.full(backend.Int32, -1, dr.width(end.status))
-    if prepared.field.jumps is not None:
+    if prepared.evaluator.jumps is not None:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
@@ -291,7 +291,7 @@ def _first_hits(
     doubt = None
     # No other hits are doubtful: with `end.side` rays hit at roots only, and hits of a steep field
     # were tested on the other side of the level.
-    if end.side is None and not prepared.field.is_steep:
+    if end.side is None and not prepared.evaluator.is_steep:
         doubt = _DistanceDoubt.of(prepared, o, end.t, length, uncertainty)
         # The distance as if several sheets of the surface met there.
         doubtful_uncertainty = _SHEET_COUNT * doubt.distance - doubt.tolerance
@@ -375,7 +375,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
 
     All arrays of the hits are evaluated. If there is no such hit, nothing is searched.
     """
-    backend, field = prepared.backend, prepared.field
+    backend, evaluator = prepared.backend, prepared.evaluator
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
     # Whether any hit is to be searched: lanes of `is_far` write a 1. This is computed by the kernel
     # that computes the hits, and needs no other one.
@@ -387,9 +387,9 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
 
     def search(hit: _SearchedHits) -> _SearchDistance:
         """Return the distance from each hit within which the surface was found."""
-        sampled = field
-        if field.patches is not None:
-            sampled = field.patches.patch(dr.reinterpret_array(backend.UInt32, hit.part))
+        sampled = evaluator
+        if evaluator.patches is not None:
+            sampled = evaluator.patches.patch(dr.reinterpret_array(backend.UInt32, hit.part))
         return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.doubtful))
 
     doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
@@ -419,7 +419,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     Raises RuntimeError if the device's hits of a sample of the rays differ from those of Dr.Jit.
     """
     count = rays.count
-    prepared = surface.prepare(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    prepared = surface.tracer(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     # A device needs every array at full width: single numbers are repeated for each ray.
     lanes = {
         name: array + dr.zeros(type(array), count)

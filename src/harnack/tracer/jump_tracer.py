@@ -203,8 +203,8 @@ class JumpTracer:
         step = fmin(self.march.over_relaxation * now.proved_step, stop - now.proved_to)
         now = dataclasses.replace(now, trial_step=step, active=active)
         # The function that is f on this interval and continues it beyond the facets.
-        field = self.jumps.continuation(o, d, behind, ahead, outer.offset)
-        now = self.march.advance(field, self.path, stop, now, ahead)
+        evaluator = self.jumps.continuation(o, d, behind, ahead, outer.offset)
+        now = self.march.advance(evaluator, self.path, stop, now, ahead)
         # A march that ends at a facet as a miss has passed it.
         passed = active & has_facet & (now.status == int(RayStatus.MISS))
         # Rays that look for crossings of the level have a contact.

@@ -71,7 +71,7 @@ def largest_component_cells(
 
     def build() -> OccupancyGrid:
         """Compute the grid, which is not in the cache."""
-        return _build_cells(field.with_levels(levels), levels, volume, solid, across)
+        return _build_cells(field, levels, volume, solid, across)
 
     if field.differentiable_parameters():  # they may change in place
         return build()
@@ -147,7 +147,7 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
     """
     domain = None if field.is_global else field.domain
     backend = choose_backend("double")
-    prepared = None if domain is None else domain.prepare(backend)
+    prepared = None if domain is None else domain.upload(backend)
 
     def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return points (n, 3) in the domain near the given ones, and the distances (n,) between
@@ -179,7 +179,7 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
     """Return a function of points (n, 3) that returns lower bounds (n,) of their distances from the
     volume; they are negative inside the volume."""
     backend = choose_backend("double")
-    prepared = volume.prepare(backend)
+    prepared = volume.upload(backend)
 
     def beyond(points: FloatArray) -> FloatArray:
         """Return lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin
@@ -197,13 +197,13 @@ def _samples(
     """Return a function of points (n, 3) that returns three arrays (n,): the differences between f
     and the nearest level, |grad f|, and f."""
     backend = choose_backend("double")
-    prepared = field.prepare(backend)
+    evaluator = field.evaluator(backend)
     targets = Levels(tuple(dr.opaque(backend.Float, level) for level in levels), field.period)
 
     def samples(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the difference between f and the nearest level, |grad f|, and f, each (n,), at
         points (n, 3)."""
-        sample = prepared.evaluate(to_vector3(backend, points))
+        sample = evaluator.evaluate(to_vector3(backend, points))
         arrays = (targets.gaps(sample.value).nearest, safe_norm(sample.gradient), sample.value)
         gap, slope, value = (np.broadcast_to(to_numpy(array), len(points)) for array in arrays)
         return gap, slope, value
@@ -215,11 +215,11 @@ def _inside_solid(field: Field, solid: _Ends) -> Callable[[FloatArray], BoolArra
     """Return a function of points (n, 3) that returns the mask (n,) of points with low <= f <=
     high, where solid = (low, high)."""
     backend = choose_backend("double")
-    prepared = field.prepare(backend)
+    evaluator = field.evaluator(backend)
 
     def within(points: FloatArray) -> BoolArray:
         """Return the mask (n,) of points (n, 3) in the solid."""
-        value = to_numpy(prepared.evaluate(to_vector3(backend, points)).value)
+        value = to_numpy(evaluator.evaluate(to_vector3(backend, points)).value)
         return np.broadcast_to((value >= solid[0]) & (value <= solid[1]), len(points))
 
     return within

@@ -35,7 +35,7 @@ from harnack.fields.capabilities import NO_FACET, JumpCrossing
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures.samples import Ray
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
 
 
 class RayStatus(enum.IntEnum):
@@ -89,7 +89,7 @@ class HitTolerance:
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
-    def prepare(self, backend: Backend) -> PreparedHitTolerance:
+    def upload(self, backend: Backend) -> PreparedHitTolerance:
         """Return this tolerance as Dr.Jit numbers of a backend that kernels take as parameters. So
         another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
@@ -585,8 +585,8 @@ class _Bisection:
 
 
 def refine_crossing(
-    field: Field, levels: Levels, tolerance: PreparedHitTolerance, path: Ray, contact: Contact,
-    active: Mask,
+    evaluator: Evaluator, levels: Levels, tolerance: PreparedHitTolerance, path: Ray,
+    contact: Contact, active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """Find where rays cross the level more exactly, by bisection where needed.
 
@@ -612,7 +612,7 @@ def refine_crossing(
     def bisect(now: _Bisection) -> _Bisection:
         """Sample f at the point t, and keep the half of the interval in which f takes the level.
         Returns the new state."""
-        sample, size = field.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
+        sample, size = evaluator.evaluate(path.point(now.t)), max_norm(path.origin) + now.t
         offset, steepness = -levels.offset_to_nearest(sample.value), safe_norm(sample.gradient)
         is_near = dr.abs(offset) <= fmax(
             tolerance.value_tolerance(steepness, now.t), value_error_bound(sample, steepness, size)

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import LevelGaps, Levels
     from harnack.enclosures.samples import Ray, RaySample, Sample
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
     from harnack.tracer.level_rule import LevelReading, LevelRule
     from harnack.tree.empty_space import EmptySpaceGrid
 
@@ -300,7 +300,7 @@ class March:
 
     def advance(
         self,
-        field: Field,
+        evaluator: Evaluator,
         path: Ray,
         end: Real,
         state: MarchState,
@@ -308,7 +308,7 @@ class March:
     ) -> MarchState:
         """March each ray to the first level or to its end, and return the state there.
 
-        field, path: the function f and the rays.
+        evaluator, path: the function f and the rays.
         end: the ray parameter at which each ray, or its interval before the next jump of f, ends.
         ahead: for a field with jumps, the crossing of a facet (a flat piece of surface at which f
             jumps) at `end`; its facet is NO_FACET on lanes without one. On lanes with one, the
@@ -342,13 +342,13 @@ class March:
 
         def one_trial(now: MarchState) -> MarchState:
             """Return the state after one more trial point of each ray. now: the state before."""
-            return self.next_trial(field, path, end, now, ahead)
+            return self.next_trial(evaluator, path, end, now, ahead)
 
         return loop_while_active(state, one_trial, "harnack")
 
     def next_trial(
         self,
-        field: Field,
+        evaluator: Evaluator,
         path: Ray,
         end: Real,
         now: MarchState,
@@ -364,10 +364,10 @@ class March:
         If the point is accepted, the ray moves there. Otherwise it stays, and tries a shorter step
         (`fallback`) or, if the sample was too coarse, the same step with a more accurate sample.
         """
-        trial = self._sample_trial(field, path, end, now, ahead)
+        trial = self._sample_trial(evaluator, path, end, now, ahead)
         if self.hysteresis is not None and now.contact is not None:
             trial = self._apply_hysteresis(trial, self.hysteresis, now.contact)
-        accepted, accuracy, too_coarse = self._accept(field, trial, now, ahead)
+        accepted, accuracy, too_coarse = self._accept(evaluator, trial, now, ahead)
         accepted, fallback = self._shorten_in_contact(trial, now, accepted, too_coarse)
         arrival = self._arrive(trial, path, now, accepted, ahead)
         jump, is_hit = arrival.jump, arrival.is_hit
@@ -476,7 +476,12 @@ class March:
         return _Arrival(is_hit, gaps, gaps, now.contact, value, jump)
 
     def _sample_trial(
-        self, field: Field, path: Ray, end: Real, now: MarchState, ahead: JumpCrossing | None
+        self,
+        evaluator: Evaluator,
+        path: Ray,
+        end: Real,
+        now: MarchState,
+        ahead: JumpCrossing | None,
     ) -> _TrialSample:
         """Evaluate f at the trial point of each ray, and derive all quantities of a `_TrialSample`.
 
@@ -490,10 +495,10 @@ class March:
         t = now.proved_to + now.trial_step
         if ahead is not None or now.contact is not None:  # the end exactly
             t = dr.select(now.trial_step >= end - now.proved_to, end, t)
-        scaled = field
-        if now.accuracy_scale is not None and field.variable_accuracy is not None:
-            scale = self.rule.accuracy_of(field.variable_accuracy, now.accuracy_scale)
-            scaled = field.variable_accuracy.at(scale)
+        scaled = evaluator
+        if now.accuracy_scale is not None and evaluator.variable_accuracy is not None:
+            scale = self.rule.accuracy_of(evaluator.variable_accuracy, now.accuracy_scale)
+            scaled = evaluator.variable_accuracy.at(scale)
         unproved, size = now.trial_step - now.proved_step, max_norm(path.origin) + t
         # Enclosures are wanted ahead of the point, and back to where the ray is proved already.
         ray_sample = scaled.sample_ray(
@@ -507,12 +512,12 @@ class March:
             gaps = gaps.reduced_by(self.cone_radius * t * reading.gradient_norm)
             gap = gaps.nearest
         steep = None
-        if field.is_steep:
+        if evaluator.is_steep:
             length = fmin(now.enclosure_reach, end - t)
-            steep = SteepPlace.at(field, self.levels, path, t, length, sample)
+            steep = SteepPlace.at(evaluator, self.levels, path, t, length, sample)
             total_error = total_error if steep.error is None else steep.error
-        gradient_norm, steepness = _gradient_bounds(reading, is_steep=field.is_steep)
-        within = self._value_tolerance(field, path, t, sample, steepness)
+        gradient_norm, steepness = _gradient_bounds(reading, is_steep=evaluator.is_steep)
+        within = self._value_tolerance(evaluator, path, t, sample, steepness)
         knows_gradient = (sample.gradient_error <= gradient_norm) | (steepness > 0)
         # Where not even the gradient is known, no hit is due to rounding.
         rounding = dr.select(knows_gradient, total_error - sample.truncation_error, 0)
@@ -525,7 +530,7 @@ class March:
             touches = steep.is_level
             is_near = (is_near | touches) & now.active & dr.isfinite(total_error)
             is_near, evaluations = self._confirms_level(
-                field, path, t, ray_sample, gaps, size, is_near, touches
+                evaluator, path, t, ray_sample, gaps, size, is_near, touches
             )
         return _TrialSample(
             t=t,
@@ -542,14 +547,14 @@ class March:
             # A ray that ends at the point need not know on which side of the level f is.
             accepts_unknown_side=is_near,
             excess=fmax(gap + total_error - within, real(0)),
-            is_smooth=ahead is None and field.variable_accuracy is None,
+            is_smooth=ahead is None and evaluator.variable_accuracy is None,
             reading=reading,
             steep=steep,
             extra_evaluations=evaluations,
         )
 
     def _value_tolerance(
-        self, field: Field, path: Ray, t: Real, sample: Sample, steepness: Real
+        self, evaluator: Evaluator, path: Ray, t: Real, sample: Sample, steepness: Real
     ) -> Real:
         """Return the largest |f - level| at a hit. For rays that look for crossings, it is the
         largest one at which contact with a level begins.
@@ -560,16 +565,16 @@ class March:
         within = self.tolerance.value_tolerance(steepness, t)
         if self.hysteresis is None:
             return within
-        if field.is_steep:
+        if evaluator.is_steep:
             # No crossing needs a larger change of f than its values allow within the tolerance.
             reach = dr.fma(t, self.tolerance.per_length, self.tolerance.distance)
-            change = largest_change(field, path.point(t), sample.value, reach)
+            change = largest_change(evaluator, path.point(t), sample.value, reach)
             within = fmax(fmin(within, change), self.tolerance.value)
         return self.hysteresis.contact_tolerance(within)
 
     def _confirms_level(
         self,
-        field: Field,
+        evaluator: Evaluator,
         path: Ray,
         t: Real,
         ray_sample: RaySample,
@@ -612,7 +617,7 @@ class March:
         is_unsure = is_near & ~is_proved
         is_beyond, evaluations = beyond(
             self.backend,
-            field,
+            evaluator,
             self.levels,
             gaps,
             p,
@@ -652,7 +657,7 @@ class March:
         )
 
     def _accept(
-        self, field: Field, trial: _TrialSample, now: MarchState, ahead: JumpCrossing | None
+        self, evaluator: Evaluator, trial: _TrialSample, now: MarchState, ahead: JumpCrossing | None
     ) -> tuple[Mask, Real | None, Mask]:
         """Decide which trial points are accepted: no level lies before them on the ray, and their
         sample is not too coarse.
@@ -660,7 +665,7 @@ class March:
         Returns the mask of accepted points, the accuracy scale of the next sample (larger is more
         accurate), and the mask of samples that were too coarse.
 
-        field: the function f; the accuracy of the next sample is chosen here.
+        evaluator: the function f; the accuracy of the next sample is chosen here.
         now: the state before the trial.
         ahead: for a function with jumps, the facet at the end of the interval; else None.
         """
@@ -678,7 +683,7 @@ class March:
         is_known = dr.isfinite(trial.total_error)  # without an error bound nothing is free
         if trial.steep is not None:  # values prove the next step
             is_known = is_known | (now.trial_step <= now.proved_step)
-        sampling = field.variable_accuracy
+        sampling = evaluator.variable_accuracy
         if now.accuracy_scale is None or sampling is None:
             return accepted & is_known, now.accuracy_scale, self.backend.Bool(False)
         truncation, coarsest = trial.on_ray.sample.truncation_error, sampling.coarsest

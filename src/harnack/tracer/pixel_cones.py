@@ -109,10 +109,12 @@ class PixelCones:
         start, t_end = self._clip()
         end = fmin(t_end, real(t_max))
         state = MarchState.at(
-            backend, start, end, active, has_detail=prepared.field.variable_accuracy is not None
+            backend, start, end, active, has_detail=prepared.evaluator.variable_accuracy is not None
         )  # fmt: skip
         margin = (
-            _START_MARGIN if prepared.field.variable_accuracy is None else _START_MARGIN_APPROXIMATE
+            _START_MARGIN
+            if prepared.evaluator.variable_accuracy is None
+            else _START_MARGIN_APPROXIMATE
         )
         # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         # (`distance` and `value` of the tolerance are 0, `per_length` is the margin.)
@@ -120,7 +122,7 @@ class PixelCones:
         rule = PlainLevels(prepared.levels)
         march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
-        now = march.advance(prepared.field, path, real(end), state)
+        now = march.advance(prepared.evaluator, path, real(end), state)
         # A hit is a point at which the ray comes to the cover.
         is_hit = now.status == int(RayStatus.HIT)
         begin = dr.select(is_hit, now.proved_to, 0)
@@ -132,10 +134,10 @@ class PixelCones:
             """Return the height over the surface at parameters t, in radii of the cone, and its
             derivative along the ray."""
             # With the accuracy at which the march has ended.
-            field, accuracy = prepared.field, prepared.field.variable_accuracy
+            evaluator, accuracy = prepared.evaluator, prepared.evaluator.variable_accuracy
             if accuracy is not None and now.accuracy_scale is not None:
-                field = accuracy.at(now.accuracy_scale)
-            sample = field.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
+                evaluator = accuracy.at(now.accuracy_scale)
+            sample = evaluator.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
             return self._height(sample.value, sample.gradient, t, side, level)
 
         def sample_once(last: _CoverState) -> _CoverState:

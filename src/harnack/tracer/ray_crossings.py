@@ -137,7 +137,7 @@ def find_crossings(
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
     dr.make_opaque(t, side, before, behind, gradient, facets)
-    jumps = prepared.field.jumps
+    jumps = prepared.evaluator.jumps
     tracer = None if jumps is None else JumpTracer(march, jumps, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
@@ -146,7 +146,7 @@ def find_crossings(
         its ray."""
         next_state, facet = now, None
         if tracer is None or now.sheets is None:
-            after = march.advance(prepared.field, path, end, now.now)
+            after = march.advance(prepared.evaluator, path, end, now.now)
         else:
             # The tracer's own state includes that of the march.
             walk = tracer.advance(now.sheets)
@@ -333,7 +333,7 @@ def trace_crossings(
         derivatives enabled.
     """
     backend, o, d = rays.backend, rays.origin, rays.direction
-    prepared = surface.prepare(backend, crosses=True)
+    prepared = surface.tracer(backend, crosses=True)
     with dr.suspend_grad():
         detached_o, detached_d, near, far = (dr.detach(array) for array in rays.arrays)
         arrays = find_crossings(prepared, detached_o, detached_d, near, far, k)

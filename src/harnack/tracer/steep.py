@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import LevelGaps, Levels
     from harnack.enclosures.samples import Ray, Sample
-    from harnack.fields.field import Field
+    from harnack.fields.evaluator import Evaluator
 
 # A level may be the value of f up to rounding if its gap is at most the first number times the
 # change of f by rounding on that side, and f changes on the other side by at most the second number
@@ -44,11 +44,13 @@ _TRIAL_COUNT, _SIDE_COUNT, _MAX_SAMPLES, _GOLDEN_SECTION = 5, 7, 100, 0.381966
 _CONTINUITY_FACTOR = 1024.0
 
 
-def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) -> Values | None:
+def values_between(
+    evaluator: Evaluator, p: Vec3, q: Vec3, slack: Real | None = None
+) -> Values | None:
     """Return the range of values of a field on the box with corners p and q, enlarged by `slack` on
     all sides. The result is None if the field has no formula that takes ranges of coordinates."""
     coordinates = Values.between(p, q, slack)
-    formula: Any = getattr(field, "formula", None)
+    formula: Any = getattr(evaluator, "formula", None)
     if formula is None:
         return None
     try:
@@ -59,13 +61,13 @@ def values_between(field: Field, p: Vec3, q: Vec3, slack: Real | None = None) ->
     return coordinates[0].coerce(value).checked()
 
 
-def largest_change(field: Field, p: Vec3, value: Real, reach: Real) -> Real:
+def largest_change(evaluator: Evaluator, p: Vec3, value: Real, reach: Real) -> Real:
     """Return a bound of |f(y) - f(p)| for |y - p| <= `reach`; inf if none is known. value: f(p).
 
     Beside a vertical tangent this is much less than |grad f| times `reach`, which may exceed all
     changes of f anywhere: |grad f| of |x y|^(1/3) - z at x = 1e-10 is 1e5.
     """
-    values = values_between(field, p, p, reach)
+    values = values_between(evaluator, p, p, reach)
     if values is None:
         return cast("Any", type(value))(dr.inf)
     change = fmax(values.value.upper - value, value - values.value.lower)
@@ -99,7 +101,7 @@ class SteepPlace:
 
     @classmethod
     def at(
-        cls, field: Field, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
+        cls, evaluator: Evaluator, levels: Levels, path: Ray, t: Real, ahead: Real, sample: Sample
     ) -> SteepPlace:
         """Compute the bounds at the parameter t of rays: of the error of f at the point, and of the
         length beyond the point on which f takes no level.
@@ -121,8 +123,8 @@ class SteepPlace:
         slack = 8 * float(dr.epsilon(real)) * (max_norm(path.origin) + t)
         # On an infinite length nothing is bounded.
         ahead = dr.select(dr.isfinite(ahead), ahead, 0)
-        at_point = values_between(field, p, p, slack)
-        on_path = values_between(field, p, path.point(t + ahead), slack)
+        at_point = values_between(evaluator, p, p, slack)
+        on_path = values_between(evaluator, p, path.point(t + ahead), slack)
         # Without a formula of values nothing is proved. (t < t is False everywhere.)
         if at_point is None or on_path is None:
             return cls(None, t < t, real(0), real(0), real(dr.inf), real(dr.inf))
@@ -226,7 +228,7 @@ def holds(levels: Levels, value: Real, low: Real, high: Real, gaps: LevelGaps) -
 
 def beyond(
     backend: Backend,
-    field: Field,
+    evaluator: Evaluator,
     levels: Levels,
     gaps: LevelGaps,
     p: Vec3,
@@ -296,15 +298,15 @@ def beyond(
         # of q whose own rounding is larger.
         half = type(p)(*(dr.select(shortest > epsilon * dr.abs(x), shortest, 0) for x in q))
         # Ranges of f at q up to rounding, between p and q, and on a larger box around q.
-        at_q = values_between(field, q - half, q + half)
-        between = values_between(field, p, q)
+        at_q = values_between(evaluator, q - half, q + half)
+        between = values_between(evaluator, p, q)
         around_q = values_between(
-            field, q - _CONTINUITY_FACTOR * half, q + _CONTINUITY_FACTOR * half
+            evaluator, q - _CONTINUITY_FACTOR * half, q + _CONTINUITY_FACTOR * half
         )
         if at_q is None or between is None or around_q is None:
             # No formula of values: the sample at q decides alone.
             with without_alternatives():
-                low = high = field.evaluate(q).value
+                low = high = evaluator.evaluate(q).value
             passed = passes(levels, value, low, high, gaps)
         else:
             low, high = at_q.value.lower, at_q.value.upper

@@ -36,6 +36,7 @@ from harnack.tracer.patch_tracer import PatchTracer
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import EnclosureKinds, Levels
+    from harnack.fields.evaluator import Evaluator
     from harnack.fields.field import Field, Sample
     from harnack.geometry import Volume
     from harnack.tracer.level_rule import LevelRule
@@ -84,12 +85,12 @@ class SmoothTracer:
     itself.
 
     march: the parameters of the march.
-    field: the function.
+    evaluator: samples the function.
     path, end: the rays, and the ray parameter at which each ends.
     """
 
     march: March
-    field: Field
+    evaluator: Evaluator
     path: Ray
     end: Real
 
@@ -99,7 +100,7 @@ class SmoothTracer:
 
     def advance(self, walk: MarchState) -> MarchState:
         """Return the state after one more trial point of each ray."""
-        return self.march.next_trial(self.field, self.path, self.end, walk)
+        return self.march.next_trial(self.evaluator, self.path, self.end, walk)
 
     def finish(self, walk: MarchState) -> tuple[MarchState, Any]:
         """Return the end state of rays, and NO_FACET, as a smooth function has no facets to hit."""
@@ -108,7 +109,7 @@ class SmoothTracer:
     def run(self, state: MarchState) -> tuple[MarchState, Any]:
         """March rays from `state` to a hit or to their end. Returns their end state, and NO_FACET.
         `March.advance` has the proof that no hit is missed."""
-        return self.finish(self.march.advance(self.field, self.path, self.end, state))
+        return self.finish(self.march.advance(self.evaluator, self.path, self.end, state))
 
 
 @dataclass(frozen=True)
@@ -256,9 +257,10 @@ class _EndStatus:
 @dataclass(frozen=True)
 class SurfaceTracer:
     """A surface prepared on a backend, with methods that trace rays o + t d to it. The surface
-    consists of the points of `volume` at which f, the function `field`, takes one of the `levels`.
-    The methods can be called while Dr.Jit records a kernel, except with `uses_ray_queue`.
+    consists of the points of `volume` at which f, the function of `field`, takes one of the
+    `levels`. The methods can be called while Dr.Jit records a kernel, except with `uses_ray_queue`.
 
+    evaluator: the evaluator of the field, which samples f on the backend.
     levels: the values of f that belong to the surface.
     volume: a volume that contains the surface; None for all of space.
     proofs: the classes of enclosures by which steps are proved. An enclosure is an interval that is
@@ -284,6 +286,7 @@ class SurfaceTracer:
 
     backend: Backend
     field: Field
+    evaluator: Evaluator
     levels: Levels
     volume: Volume | None
     proofs: EnclosureKinds
@@ -300,7 +303,7 @@ class SurfaceTracer:
 
     def sample(self, p: Vec3) -> Sample:
         """Return the sample of f (value, gradient, error bounds) at points p (3,)."""
-        return self.field.evaluate(p)
+        return self.evaluator.evaluate(p)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
         """Return the sample of f at p, with the integer added that is unknown if samples give f
@@ -309,18 +312,18 @@ class SurfaceTracer:
         value: an approximation of f at p with an error below a half. The integer is chosen for
             which f is nearest to it.
         """
-        if self.known_branch_volume is None or self.field.modulo_one is None:
+        if self.known_branch_volume is None or self.evaluator.modulo_one is None:
             return self.sample(p)
-        sample = self.field.modulo_one.evaluate(p)
+        sample = self.evaluator.modulo_one.evaluate(p)
         return sample.shifted(dr.round(value - sample.value))
 
     def hit_surface(self, hit: MarchResult) -> SurfaceTracer:
         """Return the surface that each ray hit: the patch that was hit if the field is a union of
         patches, else this surface. Rays without a hit get the first patch."""
-        if hit.patch is None or self.field.patches is None:
+        if hit.patch is None or self.evaluator.patches is None:
             return self
         patch = dr.select(hit.patch == NO_PATCH, self.backend.UInt32(0), hit.patch)
-        return replace(self, field=self.field.patches.patch(patch))
+        return replace(self, evaluator=self.evaluator.patches.patch(patch))
 
     def level_counts(self, p: Vec3) -> Mask:
         """Return the mask of the points p at which a level, if f takes one there, belongs to the
@@ -386,7 +389,7 @@ class SurfaceTracer:
             excess, side = dr.select(is_hit, contact.tolerance_excess, 0), contact.side
         t = dr.select(end.status == int(RayStatus.MISS), dr.inf, t)
         patch = None
-        if self.field.patches is not None:  # the index is that of a patch, and no facet was hit
+        if self.evaluator.patches is not None:  # the index is that of a patch, and no facet was hit
             facet, patch = self.backend.UInt32(NO_FACET), facet
         return MarchResult(
             t, end.value, gradient, excess, evaluations, end.status, facet, side, patch
@@ -402,14 +405,14 @@ class SurfaceTracer:
             unchanged if f has jumps, or if it has no creases, as then it is good enough.
         active: mask of rays with a crossing.
         """
-        if self.field.jumps is not None or not self.field.has_creases:
+        if self.evaluator.jumps is not None or not self.field.has_creases:
             return (
                 contact.root,
                 contact.gradient,
                 dr.zeros(self.backend.UInt32, dr.width(contact.root)),
             )
         path = Ray(self.backend.Array3f(o), self.backend.Array3f(d), self.proofs)
-        return refine_crossing(self.field, self.levels, self.tolerance, path, contact, active)
+        return refine_crossing(self.evaluator, self.levels, self.tolerance, path, contact, active)
 
     def begin_march(
         self, o: Vec3, d: Vec3, t_min: Real, t_max: Real, active: Mask, *, crosses: bool
@@ -433,9 +436,9 @@ class SurfaceTracer:
         # Rays that are not active get an empty interval.
         t_min, t_max = real(t_min), dr.select(active, real(t_max), real(t_min))
         start, end = self.clip(path.origin, path.direction, t_min, t_max)
-        has_jumps = self.field.jumps is not None
+        has_jumps = self.evaluator.jumps is not None
         # The functions that continue f beyond its jumps may have samples of several accuracies.
-        has_detail = self.field.variable_accuracy is not None or has_jumps
+        has_detail = self.evaluator.variable_accuracy is not None or has_jumps
         hysteresis = None
         if crosses:
             start, end, hysteresis = self._crossing_interval(
@@ -463,7 +466,7 @@ class SurfaceTracer:
             status = dr.select(in_uncertain_cell, out_of_steps, state.status)
             state = replace(state, active=state.active & ~in_uncertain_cell, status=status)
         rule: LevelRule = PlainLevels(self.levels)
-        samples, known = self.field.modulo_one, self.known_branch_volume
+        samples, known = self.evaluator.modulo_one, self.known_branch_volume
         if samples is not None and known is not None and not crosses:
             rule = tracker = BranchTracker(self.levels)
             state = tracker.begin(samples, known, path, (t_min, t_max), state)
@@ -558,11 +561,11 @@ class SurfaceTracer:
             path, start, end: the rays, and the ray parameters between which they are traced.
             """
             to_end = replace(march, ray_end=end)
-            if self.field.jumps is not None:
-                return JumpTracer(to_end, self.field.jumps, path, start, end)
-            if self.field.patches is not None:
-                return PatchTracer(to_end, self.field.patches, path, start, end, any_hit)
-            return SmoothTracer(to_end, self.field, path, end)
+            if self.evaluator.jumps is not None:
+                return JumpTracer(to_end, self.evaluator.jumps, path, start, end)
+            if self.evaluator.patches is not None:
+                return PatchTracer(to_end, self.evaluator.patches, path, start, end, any_hit)
+            return SmoothTracer(to_end, self.evaluator, path, end)
 
         if self.uses_ray_queue and march.hysteresis is None and not self.field.is_cheap:
             return trace_queued(tracer, path, start, end, state, collect)

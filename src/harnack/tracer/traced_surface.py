@@ -19,6 +19,7 @@ from harnack.backend import to_float
 from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
+from harnack.fields.evaluator import Plan
 from harnack.name_suggestions import with_article
 from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
@@ -33,6 +34,7 @@ from harnack.tracer.trace_options import (
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
+    from harnack.fields.evaluator import Evaluator
     from harnack.fields.field import Field
     from harnack.geometry import Volume
     from harnack.tracer.surface import Side
@@ -88,6 +90,8 @@ class TracedSurface:
     max_steps: the number of evaluations of f after which a ray is out of steps.
     over_relaxation: trial steps are at most this many times as long as proved steps.
     require_crossing: whether a ray hits only where f passes to the other side of the level.
+    ray_count: the number of rays that will be traced; 0 if it is not known. For many rays a field
+        may make a longer preparation (`Plan`).
     """
 
     field: Field
@@ -101,6 +105,7 @@ class TracedSurface:
     max_steps: int = 2000
     over_relaxation: float = 1.4
     require_crossing: bool = False
+    ray_count: int = 0
     # Results of `memoize`; None outside of a call of the library.
     _call_cache: CallCache | None = dataclasses.field(
         default=None, repr=False, compare=False, kw_only=True
@@ -161,12 +166,12 @@ class TracedSurface:
                 one level at once.
             NotImplementedError: the field is a union of patches, each with a function of its own.
         """
-        if self.field.patches is not None:
+        if self.field.has_patches:
             raise NotImplementedError(
                 f"{option} takes one function, and this {type(self.field).__name__} has one for "
                 "each patch: trace a patch by itself, such as mesh.face(0) of a polygon mesh"
             )
-        if self.field.jumps is not None and len(self.levels) > 1:
+        if self.field.has_jumps and len(self.levels) > 1:
             raise ValueError(
                 f"{option} takes one level of a field with jumps, such as this "
                 f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
@@ -225,17 +230,21 @@ class TracedSurface:
         return default_tolerance(self.volume) if self.tolerance is None else self.tolerance
 
     def for_rays(self, count: int) -> TracedSurface:
-        """Return this surface with its field replaced by the one that suits `count` rays
-        (`Field.for_ray_count`)."""
-        return replace(self, field=self.field.for_ray_count(count))
+        """Return this surface with the number of rays that will be traced, `ray_count`."""
+        return replace(self, ray_count=count)
 
-    def evaluator(self, backend: Backend) -> Field:
-        """Return the field, prepared for its levels and for a backend. It is cached; a field with
-        derivatives enabled and one without have separate entries."""
+    def evaluator(self, backend: Backend) -> Evaluator:
+        """Return the field's evaluator for these levels and this number of rays. It is cached; a
+        field with derivatives enabled and one without have separate entries."""
         parameters = self.field.differentiable_parameters()
         has_derivatives = any(map(dr.grad_enabled, parameters))
-        key = "field", backend, has_derivatives
-        return self.memoize(key, lambda: self.field.with_levels(self.level_values).prepare(backend))
+        key, plan = ("evaluator", backend, self.ray_count, has_derivatives), self.plan
+        return self.memoize(key, lambda: self.field.evaluator(backend, plan))
+
+    @property
+    def plan(self) -> Plan:
+        """What evaluators of the field will be used for."""
+        return Plan(self.level_values, self.ray_count)
 
     def target_levels(self, backend: Backend) -> Levels:
         """Return the levels as Dr.Jit numbers that kernels take as parameters, with the period of
@@ -265,7 +274,7 @@ class TracedSurface:
             if box is not None:
                 check_length_range(box.bounds(), backend.precision, "the surface has")
 
-    def prepare(
+    def tracer(
         self, backend: Backend, *, crosses: bool = False, many_rays: bool = True
     ) -> SurfaceTracer:
         """Return the tracer of this surface, with all data on a backend, for use in a recorded
@@ -287,29 +296,30 @@ class TracedSurface:
         # Rays that look for crossings start a little outside the extent, but inside `region`.
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
-        field, known_volume = self.evaluator(backend), None
+        evaluator, known_volume = self.evaluator(backend), None
         # No level may be nearly an integer.
-        if field.modulo_one is not None and all(
+        if evaluator.modulo_one is not None and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
         ):
             # Outside the extent of the levels and of their remainders modulo 1, f is nearer to 0
             # than all of these.
             extent = self.field.extent(_with_reduced_levels(self.level_values))
-            known_volume = None if extent is None else extent.prepare(backend)
+            known_volume = None if extent is None else extent.upload(backend)
         return SurfaceTracer(
             backend,
-            field,
+            self.field,
+            evaluator,
             self.target_levels(backend),
-            None if volume is None else volume.prepare(backend),
+            None if volume is None else volume.upload(backend),
             self.enclosures,
-            self.hit_tolerance.prepare(backend),
+            self.hit_tolerance.upload(backend),
             dr.opaque(backend.UInt32, self.max_steps),
             self.over_relaxation,
             self.require_crossing,
-            None if region is None else region.prepare(backend),
+            None if region is None else region.upload(backend),
             None if occupied is None else occupied.upload(backend),
             only_component=self.largest > 0,
-            section=None if self.section is None else self.section.prepare(backend),
+            section=None if self.section is None else self.section.upload(backend),
             known_branch_volume=known_volume,
         )
 
@@ -346,12 +356,12 @@ def check_has_inside(surface: TracedSurface) -> None:
         return
     if field.period is not None:
         raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
-    if field.patches is not None:
+    if field.has_patches:
         raise ValueError(
             f"{with_article(type(field).__name__)} is many surfaces and no closed solid: draw it "
             "without side"
         )
-    if field.jumps is not None:
+    if field.has_jumps:
         raise ValueError(
             "a field that jumps has no closed solid: values on one side may end at a facet, with "
             "no level there; draw its level set without side"
