@@ -493,10 +493,6 @@ class HeightField(Formula):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return z - self.function(x, y)
 
-    def prepare(self, backend: Backend) -> Formula:
-        del backend
-        return self
-
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The part of the domain between the lowest and the highest height that the level sets can
         have over it; the whole domain if the heights are not bounded or exceed it.
