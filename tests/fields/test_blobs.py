@@ -13,9 +13,9 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import LevelGaps, choose_enclosures, longest_free_length
 from harnack.enclosures.samples import Ray
-from harnack.fields import FormulaEvaluator
 from harnack.fields.blobs.blob_sums import for_each_record, sum_along
 from harnack.fields.blobs.grid import CellLists
+from harnack.fields.formula import FormulaEvaluator
 from harnack.testing import check_field
 
 KERNELS = {
