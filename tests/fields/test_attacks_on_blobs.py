@@ -262,7 +262,7 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     d /= np.linalg.norm(d, axis=1)[:, None]
     p, d = (one.astype(backend.dtype).astype(np.float64) for one in (p, d))
     knots = [0.0, backend.Float(1e-9), backend.Float(2e-9)]
-    on_backend: Any = f.evaluator(backend).formula
+    on_backend: Any = f.evaluator(backend).function
     found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     v = p[:, None] - f.points
     r = np.linalg.norm(v, axis=-1)

@@ -179,7 +179,7 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     p, d = rounded(backend, center + beside[:, None] * aside - before[:, None] * d, d)
     (length,) = rounded(backend, rng.random(count) * reach * 2 + before)
     knots = [0.0, *(backend.Float(part * length) for part in (0.4, 0.9, 1.0))]
-    on_backend: Any = blob.evaluator(backend).formula
+    on_backend: Any = blob.evaluator(backend).blobs
     found = sum_along(
         on_backend.kernel, backend, to_vector3(backend, p), to_vector3(backend, d), knots,
         for_each_record(on_backend.records),

@@ -71,7 +71,7 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
     p, d = (one.astype(backend.dtype).astype(np.float64) for one in (start, d))
     length = (rng.random(count) * 3).astype(backend.dtype).astype(np.float64)
     knots = [0.0, backend.Float(0.4 * length), backend.Float(length)]
-    on_backend: Any = f.evaluator(backend).formula
+    on_backend: Any = f.evaluator(backend).function
     found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     ends = [0 * length, *(to_numpy(one).astype(np.float64) for one in knots[1:])]
     width: list[Any] = []

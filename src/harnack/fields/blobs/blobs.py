@@ -144,7 +144,7 @@ class Blobs(Formula):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
         del plan
         blobs = self._upload(backend)
-        return _BlobsEvaluator(self, blobs, blobs.lipschitz)
+        return _BlobsEvaluator(self, blobs, blobs.lipschitz, blobs)
 
     def formula_on(self, backend: Backend) -> FormulaFunction:
         return self._upload(backend)
@@ -302,15 +302,15 @@ class _DeviceBlobs:
 class _BlobsEvaluator(FormulaEvaluator):
     """The evaluator of blobs.
 
-    formula: the blobs on the backend, which are also the formula.
+    blobs: the blobs on the backend, which are also the formula.
     """
 
-    formula: _DeviceBlobs
+    blobs: _DeviceBlobs
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds
         everywhere."""
-        return self.formula.sample(self.formula.value_at(p))
+        return self.blobs.sample(self.blobs.value_at(p))
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
@@ -329,7 +329,7 @@ class _BlobsEvaluator(FormulaEvaluator):
         """
         del back
         p, d = path.point(t), path.direction
-        blobs = self.formula
+        blobs = self.blobs
         piece_count = PIECES if blobs.grid is None else PIECES_IN_CELL
         # The proofs are asked first at which knots they want ranges of derivatives; those are then
         # computed in the one loop over the blobs.
@@ -391,7 +391,7 @@ class _BlobsEvaluator(FormulaEvaluator):
         """The three rows of the Hessian of f at points p. If blobs have groups, it is the Hessian
         of the largest of the groups' sums at p, which `FormulaEvaluator.hessian` computes with
         jets."""
-        blobs = self.formula
+        blobs = self.blobs
         if blobs.groups is not None:
             return super().hessian(p)
         xx, xy, xz, yy, yz, zz = hessian_at(blobs.kernel, blobs.backend, p, blobs.near(p))

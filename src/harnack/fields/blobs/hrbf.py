@@ -111,7 +111,7 @@ class HRBF(Formula):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
         del plan
         function = self._upload(backend)
-        return _HRBFEvaluator(self, function, function.lipschitz)
+        return _HRBFEvaluator(self, function, function.lipschitz, function)
 
     def formula_on(self, backend: Backend) -> FormulaFunction:
         return self._upload(backend)
@@ -359,15 +359,15 @@ class _DeviceFunction:
 class _HRBFEvaluator(FormulaEvaluator):
     """The evaluator of `HRBF`.
 
-    formula: the function on the backend, which is also the formula.
+    function: the function on the backend, which is also the formula.
     """
 
-    formula: _DeviceFunction
+    function: _DeviceFunction
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds in
         the domain."""
-        return self.formula.sample(self.formula.value_at(p))
+        return self.function.sample(self.function.value_at(p))
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
@@ -390,17 +390,17 @@ class _HRBFEvaluator(FormulaEvaluator):
         # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
         if recorder.knots is None:
             return path.enclose(self.evaluate(p))
-        sums = self.formula.along(p, d, recorder.knots)
+        sums = self.function.along(p, d, recorder.knots)
         slope = dr.dot(sums.start.gradient, d)
         slopes = SlopeRange.around(slope, sums.start.gradient_error)
         enclosures = path.proofs.from_restriction(sums, slopes, length)
         # The next sample asks for enclosures up to as many lengths of this step as there are
         # pieces.
-        return RaySample(self.formula.sample(sums.start), enclosures, (), slope, PIECES)
+        return RaySample(self.function.sample(sums.start), enclosures, (), slope, PIECES)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """The three rows of the Hessian of f at p, by a sum over the points p_i."""
-        backend, records = self.formula.backend, self.formula.records
+        backend, records = self.function.backend, self.function.records
         pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
         def add_point(row: list[Real], state: State) -> State:
