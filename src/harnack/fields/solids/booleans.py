@@ -167,9 +167,9 @@ class BooleanSolid(Solid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return _extremum([part.formula(x, y, z) for part in self.parts], is_union=self.is_union)
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> ExtremumEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> BooleanSolidEvaluator:
         parts = tuple(part.evaluator(backend, plan) for part in self.parts)
-        return ExtremumEvaluator(parts, self.is_union)
+        return BooleanSolidEvaluator(parts, self.is_union)
 
 
 def _extremum(values: list[Any], *, is_union: bool) -> Any:
@@ -181,7 +181,7 @@ def _extremum(values: list[Any], *, is_union: bool) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class ExtremumEvaluator(Evaluator):
+class BooleanSolidEvaluator(Evaluator):
     """The evaluator of the minimum or the maximum of functions f_i, those of the operands. It is
     computed as `BooleanSolid` describes.
 
@@ -209,7 +209,7 @@ class ExtremumEvaluator(Evaluator):
             """The combination, with its operands sampled at this accuracy scale."""
             pairs = zip(self.parts, accuracies, strict=True)
             parts = tuple(part if a is None else a.at(scale) for part, a in pairs)
-            return ExtremumEvaluator(parts, self.is_union)
+            return BooleanSolidEvaluator(parts, self.is_union)
 
         # `coarsest` is the accuracy scale of the coarsest samples that an operand has.
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
@@ -468,10 +468,10 @@ class Complement(SolidOfField):
         return -self.field.formula(x, y, z)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        return _NegatedEvaluator(self.field.evaluator(backend, without_levels(plan)))
+        return _ComplementEvaluator(self.field.evaluator(backend, without_levels(plan)))
 
 
-class _NegatedEvaluator(EvaluatorOfInner):
+class _ComplementEvaluator(EvaluatorOfInner):
     """The evaluator of -f, from that of f."""
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -540,11 +540,11 @@ class OffsetSolid(SolidOfField):
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         inner = self.field.evaluator(backend, without_levels(plan))
-        return _OffsetEvaluator(inner, on_backend(self.distance, backend))
+        return _OffsetSolidEvaluator(inner, on_backend(self.distance, backend))
 
 
 @dataclass(frozen=True, eq=False)
-class _OffsetEvaluator(EvaluatorOfInner):
+class _OffsetSolidEvaluator(EvaluatorOfInner):
     """The evaluator of f - distance, from that of f.
 
     distance: a kernel parameter.

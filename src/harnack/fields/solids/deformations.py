@@ -134,7 +134,7 @@ class DeformedSolid(FormulaSolid):
         # The constant of the inner solid; on the backend, if it is a formula.
         constant = inner.lipschitz if isinstance(inner, FormulaEvaluator) else self.inner.lipschitz
         formula = _DeformedFormula(formula_of(inner), change)
-        return _DeformedEvaluator(self, formula, self.lipschitz, constant, change)
+        return _DeformedSolidEvaluator(self, formula, self.lipschitz, constant, change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,7 @@ class _DeformedFormula:
 
 
 @dataclass(frozen=True, eq=False)
-class _DeformedEvaluator(FormulaEvaluator):
+class _DeformedSolidEvaluator(FormulaEvaluator):
     """The evaluator of a `DeformedSolid`.
 
     constant: a Lipschitz constant of the inner solid; None if none is known.

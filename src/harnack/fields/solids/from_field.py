@@ -148,9 +148,11 @@ class SublevelSolid(SolidOfField):
 
         return bounded_side_extent(self.field, (level,), is_inside)
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SublevelEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SublevelSolidEvaluator:
         inner = self.field.evaluator(backend, plan)
-        return _SublevelEvaluator(inner, type(self.field).__name__, isinstance(self.field, Formula))
+        return _SublevelSolidEvaluator(
+            inner, type(self.field).__name__, isinstance(self.field, Formula)
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if isinstance(self.field, Formula):
@@ -160,14 +162,14 @@ class SublevelSolid(SolidOfField):
 
 
 @dataclass(frozen=True, eq=False)
-class _SublevelEvaluator(EvaluatorOfInner):
+class _SublevelSolidEvaluator(EvaluatorOfInner):
     """The evaluator of a `SublevelSolid`, whose function is that of the field.
 
-    name: the name of the field's class, for messages.
+    field_name: the name of the field's class, for messages.
     has_formula: whether the field is a `Formula`.
     """
 
-    name: str
+    field_name: str
     has_formula: bool
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -184,9 +186,9 @@ class _SublevelEvaluator(EvaluatorOfInner):
         arithmetic."""
         if self.has_formula:
             return formula_of(self.inner)(x, y, z)
-        if not is_jet(x, self.name):
+        if not is_jet(x, self.field_name):
             return self.differentiable_value(_vector(x, y, z))
-        return field_jet(self.inner, x, y, z, self.name)
+        return field_jet(self.inner, x, y, z, self.field_name)
 
 
 def bounded_side_extent(
@@ -424,7 +426,7 @@ class BandSolid(SolidOfField):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         inner = self.field.evaluator(backend, without_levels(plan))
         level, half_width = on_backend((self.level, self.half_width), backend)
-        return _BandEvaluator(inner, level, half_width, self.field.period)
+        return _BandSolidEvaluator(inner, level, half_width, self.field.period)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not isinstance(self.field, Formula | Solid):
@@ -457,7 +459,7 @@ class BandSolid(SolidOfField):
 
 
 @dataclass(frozen=True, eq=False)
-class _BandEvaluator(EvaluatorOfInner):
+class _BandSolidEvaluator(EvaluatorOfInner):
     """The evaluator of a `BandSolid`, from that of f.
 
     level, half_width: kernel parameters.

@@ -389,7 +389,7 @@ def formula_of(evaluator: Evaluator) -> FormulaFunction:
     """
     formula: FormulaFunction | None = getattr(evaluator, "formula", None)
     if formula is None:
-        raise TypeError(f"{type(evaluator).__name__} has no formula")
+        raise TypeError(f"{evaluator.name} has no formula")
     return formula
 
 

@@ -269,10 +269,9 @@ class TransformedSolid(SolidOfField):
         return self.map.volume(self.field.sublevel_extent(inner_level, above=above))
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        return _TransformedEvaluator(
+        return _TransformedSolidEvaluator(
             self.field.evaluator(backend, without_levels(plan)),
             self.inverse_map.on_backend(backend),
-            type(self.field).__name__,
             is_similarity=self.map.similarity is not None,
         )
 
@@ -293,16 +292,14 @@ def _formula_of_image(
 
 
 @dataclass(frozen=True, eq=False)
-class _TransformedEvaluator(EvaluatorOfInner):
+class _TransformedSolidEvaluator(EvaluatorOfInner):
     """The evaluator of a `TransformedSolid`, from that of the inner solid.
 
     numbers: the inverse map, on the backend.
-    name: the name of the inner solid's class, for messages.
     is_similarity: whether the map multiplies all lengths by the same factor.
     """
 
     numbers: _InverseMap
-    name: str
     is_similarity: bool
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -342,7 +339,7 @@ class _TransformedEvaluator(EvaluatorOfInner):
         if not isinstance(self.inner, FormulaEvaluator):
             return first, second * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
-        jet = as_jet(self.formula(*coordinates), coordinates[0], self.name)
+        jet = as_jet(self.formula(*coordinates), coordinates[0], self.inner.name)
         # The gradient of the inner solid need not be the middle of its range
         # (`FormulaEvaluator._with_one_sided_gradient`). So the half widths of the ranges are added
         # to its error.
