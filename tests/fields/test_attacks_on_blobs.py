@@ -262,8 +262,8 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     d /= np.linalg.norm(d, axis=1)[:, None]
     p, d = (one.astype(backend.dtype).astype(np.float64) for one in (p, d))
     knots = [0.0, backend.Float(1e-9), backend.Float(2e-9)]
-    prepared: Any = f.prepare(backend)
-    found = prepared._along(to_vector3(backend, p), to_vector3(backend, d), knots)
+    on_backend: Any = f.evaluator(backend).function
+    found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     v = p[:, None] - f.points
     r = np.linalg.norm(v, axis=-1)
     along = (v * d[:, None]).sum(-1)
@@ -301,10 +301,10 @@ def test_blobs_that_a_precision_does_not_hold(
     blobs = hk.Blobs([[0, 0, 0], [center, 0, 0]], [1.0, radius], [1.0, weight])
     backend = choose_backend(precision)
     if precision == "double" and most == "single":
-        blobs.prepare(backend)
+        blobs.evaluator(backend)
         return
     with pytest.raises(BlobError, match=f"^blob 1, .* for {precision} precision: "):
-        blobs.prepare(backend)
+        blobs.evaluator(backend)
 
 
 def test_radii_may_not_be_of_any_size() -> None:

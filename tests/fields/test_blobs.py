@@ -13,9 +13,9 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import LevelGaps, choose_enclosures, longest_free_length
 from harnack.enclosures.samples import Ray
-from harnack.fields import Formula
 from harnack.fields.blobs.blob_sums import for_each_record, sum_along
 from harnack.fields.blobs.grid import CellLists
+from harnack.fields.formula import FormulaEvaluator
 from harnack.testing import check_field
 
 KERNELS = {
@@ -122,12 +122,14 @@ def test_values_and_derivatives(kernel: Any, grouped: bool, count: int) -> None:
     )
     # The formula of jets is another way to the same numbers.
     backend = choose_backend("double")
-    prepared = blobs.prepare(backend)
+    evaluator = blobs.evaluator(backend)
     p = to_vector3(backend, x)
-    sample, jet = prepared.evaluate(p), Formula.evaluate(prepared, p)
+    sample, jet = evaluator.evaluate(p), FormulaEvaluator.evaluate(evaluator, p)
     np.testing.assert_allclose(to_numpy(sample.value), to_numpy(jet.value), atol=1e-11)
     np.testing.assert_allclose(to_numpy(sample.gradient), to_numpy(jet.gradient), atol=1e-10)
-    for mine, other in zip(prepared.hessian(p), Formula.hessian(prepared, p), strict=True):
+    for mine, other in zip(
+        evaluator.hessian(p), FormulaEvaluator.hessian(evaluator, p), strict=True
+    ):
         np.testing.assert_allclose(to_numpy(mine), to_numpy(other), atol=1e-9)
 
 
@@ -144,7 +146,7 @@ def test_single_precision_is_within_the_stated_error(kernel: Any) -> None:
         blobs = hk.Blobs(base.centers + offset, base.radii, base.weights, kernel=kernel)
         single = choose_backend("single")
         (x,) = rounded(single, np.random.default_rng(3).uniform(-6, 6, (2000, 3)) + offset)
-        sample = blobs.prepare(single).evaluate(to_vector3(single, x))
+        sample = blobs.evaluator(single).evaluate(to_vector3(single, x))
         value = to_numpy(sample.value).astype(np.float64)
         error = to_numpy(sample.value_error) + 8 * 2.0**-23 * np.abs(value) + 1e-37
         assert (np.abs(value - Oracle(blobs).value(x)) <= error).all()
@@ -177,10 +179,10 @@ def test_ranges_hold_and_are_attained(kernel: Any, precision: Any, offset: float
     p, d = rounded(backend, center + beside[:, None] * aside - before[:, None] * d, d)
     (length,) = rounded(backend, rng.random(count) * reach * 2 + before)
     knots = [0.0, *(backend.Float(part * length) for part in (0.4, 0.9, 1.0))]
-    prepared: Any = blob.prepare(backend)
+    on_backend: Any = blob.evaluator(backend).blobs
     found = sum_along(
-        prepared.kernel, backend, to_vector3(backend, p), to_vector3(backend, d), knots,
-        for_each_record(prepared._on.records),
+        on_backend.kernel, backend, to_vector3(backend, p), to_vector3(backend, d), knots,
+        for_each_record(on_backend.records),
     )  # fmt: skip
     ends = [np.zeros(count), *(to_numpy(one).astype(np.float64) for one in knots[1:])]
     slack: list[Any] = []
@@ -261,7 +263,7 @@ def test_steps_are_free_and_no_longer(
     p, d, length = lines(250, 11)
     p, d, length = rounded(backend, p, d, length)
     path = Ray(to_vector3(backend, p), to_vector3(backend, d), choose_enclosures(enclosures))
-    look = blobs.prepare(backend).sample_ray(path, backend.Float(0), backend.Float(length), 0.0)
+    look = blobs.evaluator(backend).sample_ray(path, backend.Float(0), backend.Float(length), 0.0)
     value = to_numpy(look.sample.value).astype(np.float64)
     rng = np.random.default_rng(1)
     size = 10 ** rng.uniform(-4, 0.5, len(p))
@@ -384,7 +386,7 @@ def test_blobs_in_other_formulas() -> None:
     """Blobs squeezed to half their height, as a formula, against the same squeezed by hand."""
     blobs = scene(12)
     backend = choose_backend("double")
-    inner: Any = blobs.prepare(backend)
+    inner: Any = blobs.evaluator(backend)
     squeezed = hk.expression(lambda x, y, z: inner.formula(x, y, 2 * z), level=1.0)
     o, d, _ = box_rays(blobs, 400)
     flat, way = o * [1, 1, 0.5], d * [1, 1, 0.5]

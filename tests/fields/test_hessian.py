@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -54,13 +54,13 @@ HARMONIC = ("triangle", "wavy", "large trefoil", "holes", "Y 0,0 + x", "Y 12,-7"
 
 def gradient(field: hk.Field, points: np.ndarray) -> np.ndarray:
     backend = choose_backend("double")
-    sample = field.prepare(backend).evaluate(to_vector3(backend, points))
+    sample = field.evaluator(backend).evaluate(to_vector3(backend, points))
     return np.broadcast_to(to_numpy(sample.gradient), points.shape)
 
 
 def hessian(field: hk.Field, points: np.ndarray, precision: Any = "double") -> np.ndarray:
     backend = choose_backend(precision)
-    rows = field.prepare(backend).hessian(to_vector3(backend, points))
+    rows = field.evaluator(backend).hessian(to_vector3(backend, points))
     return np.stack([np.broadcast_to(to_numpy(row), points.shape) for row in rows], axis=1).astype(
         np.float64
     )
@@ -218,13 +218,14 @@ def test_single_precision_is_usable(name: str, place: str) -> None:
 
 
 def test_a_hessian_may_be_asked_for_in_a_recorded_loop() -> None:
-    field = FIELDS["wavy"].prepare(choose_backend("double"))
     backend = choose_backend("double")
+    field = FIELDS["wavy"]
+    evaluator = field.evaluator(backend)
     x = np.random.default_rng(4).uniform(-1, 1, (10, 3))
     p = to_vector3(backend, x)
 
     def body(i: Any, total: Any) -> Any:
-        return i + 1, total + field.hessian(p)[0]
+        return i + 1, total + evaluator.hessian(p)[0]
 
     start = (backend.UInt32(0), backend.Array3f(0))
     _, total = dr.while_loop(start, lambda i, _: i < 3, body)
@@ -261,9 +262,14 @@ class Spoiled(hk.Field):
         ball = hk.proofs.HarmonicBall(type(p.x)(1.0), -8.0, 8.0)
         return hk.fields.Sample(p.x * p.y, type(p)(p.y, p.x, 0.0), (ball,))
 
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        return SpoiledEvaluator(self, backend)
+
+
+class SpoiledEvaluator(hk.fields.SampleEvaluator):
     def hessian(self, p: Any) -> Any:
-        row = type(p)
-        return row(self.xx, 1 + self.xy, 0), row(1 + self.yx, self.yy, 0), row(0.0)
+        row, field = type(p), cast("Spoiled", self.field)
+        return row(field.xx, 1 + field.xy, 0), row(1 + field.yx, field.yy, 0), row(0.0)
 
 
 @pytest.mark.parametrize(
@@ -289,6 +295,8 @@ class Creased(Spoiled):
 
     def evaluate(self, p: Any) -> hk.fields.Sample:
         return dataclasses.replace(super().evaluate(p), promises=(hk.proofs.Lipschitz(1.0),))
+
+    evaluator = Spoiled.evaluator
 
 
 def test_check_field_sees_a_wrong_hessian_where_there_may_be_creases() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields import Formula
+from harnack.fields.formula import FormulaEvaluator
 from harnack.testing import check_field
 
 
@@ -33,12 +33,12 @@ def test_values_and_derivatives_are_those_of_the_formula() -> None:
     f = surface()
     check_field(f, count=60, directions=4)
     backend = choose_backend("double")
-    prepared = f.prepare(backend)
+    evaluator = f.evaluator(backend)
     p = to_vector3(backend, np.random.default_rng(0).uniform(-1.3, 1.3, (300, 3)))
-    one, two = prepared.evaluate(p), Formula.evaluate(prepared, p)
+    one, two = evaluator.evaluate(p), FormulaEvaluator.evaluate(evaluator, p)
     np.testing.assert_allclose(to_numpy(one.value), to_numpy(two.value), atol=1e-11)
     np.testing.assert_allclose(to_numpy(one.gradient), to_numpy(two.gradient), atol=1e-11)
-    for a, b in zip(prepared.hessian(p), Formula.hessian(prepared, p), strict=True):
+    for a, b in zip(evaluator.hessian(p), FormulaEvaluator.hessian(evaluator, p), strict=True):
         np.testing.assert_allclose(to_numpy(a), to_numpy(b), atol=1e-11)
 
 
@@ -48,7 +48,7 @@ def test_single_precision_is_within_the_stated_error(offset: float) -> None:
     f = hk.fields.HRBF(base.points + offset, base.normals)
     x = np.random.default_rng(0).uniform(-1.5, 1.5, (1000, 3)) + offset
     x = x.astype(np.float32).astype(np.float64)
-    sample = f.prepare(choose_backend("single")).evaluate(to_vector3(choose_backend("single"), x))
+    sample = f.evaluator(choose_backend("single")).evaluate(to_vector3(choose_backend("single"), x))
     off = np.abs(to_numpy(sample.value) - f.value(x, precision="double"))
     assert (off <= to_numpy(sample.value_error)).all()
     turned = to_numpy(sample.gradient) - f.gradient(x, precision="double")
@@ -71,8 +71,8 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
     p, d = (one.astype(backend.dtype).astype(np.float64) for one in (start, d))
     length = (rng.random(count) * 3).astype(backend.dtype).astype(np.float64)
     knots = [0.0, backend.Float(0.4 * length), backend.Float(length)]
-    prepared: Any = f.prepare(backend)
-    found = prepared._along(to_vector3(backend, p), to_vector3(backend, d), knots)
+    on_backend: Any = f.evaluator(backend).function
+    found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     ends = [0 * length, *(to_numpy(one).astype(np.float64) for one in knots[1:])]
     width: list[Any] = []
     for k, part in enumerate(found.parts):

@@ -188,7 +188,7 @@ def test_ranges_on_balls_hold_the_slopes_beside_corners(solid: Any) -> None:
     """At the middle of the ball one face is nearest, elsewhere in it others."""
     backend, middle, radius = choose_backend("double"), np.array([0.9, 0.7, 0.6]), 0.4
     coordinates = Jet.over_ball(backend.Array3f(*map(float, middle)), backend.Float(radius))
-    slopes = solid.prepare(backend).formula(*coordinates).first_derivatives
+    slopes = solid.formula_on(backend)(*coordinates).first_derivatives
     x = middle + np.random.default_rng(5).uniform(-radius, radius, (200, 3))
     for slope, own in zip(slopes, solid.gradient(x, precision="double").T, strict=True):
         low, high = (to_numpy(backend.Float(one))[0] for one in (slope.lower, slope.upper))

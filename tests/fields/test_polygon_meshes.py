@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import math
 from typing import Any
@@ -12,9 +11,10 @@ import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend import Backend, backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend import Backend, choose_backend, to_numpy, to_vector3
 from harnack.backend.validation import FloatArray
 from harnack.fields.capabilities import NO_FACET
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere
 from harnack.geometry.meshes import MeshError
 from harnack.geometry.polygon_meshes import cluster_into_polygons
@@ -82,23 +82,15 @@ class OnePart(hk.Field):
     """One part of a field, as a field of its own."""
 
     def __init__(self, whole: hk.PolygonMesh | hk.solids.TubeNetwork, index: int) -> None:
-        self.whole, self.index, self.one = whole, index, whole
+        self.whole, self.index = whole, index
         self.period, self.default_level = whole.period, whole.default_level  # type: ignore[misc]
         lower, upper = (ends[index] for ends in whole.boxes())
         self.box = hk.Box(tuple(lower), tuple(upper))
 
-    def prepare(self, backend: Backend) -> hk.Field:
-        made = copy.copy(self)
-        made.one = self.whole.prepare(backend).patch(dr.opaque(backend.UInt32, self.index))
-        return made
-
-    def evaluate(self, p: Any) -> hk.fields.Sample:
-        if self.one is self.whole:
-            return self.prepare(backend_of(p)).evaluate(p)
-        return self.one.evaluate(p)
-
-    def sample_ray(self, path: Any, t: Any, ahead: Any, back: Any) -> Any:
-        return self.one.sample_ray(path, t, ahead, back)
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        patches = self.whole.evaluator(backend, plan).patches
+        assert patches is not None
+        return patches.patch(dr.opaque(backend.UInt32, self.index))
 
     def extent(self, levels: tuple[float, ...]) -> hk.Box:
         return self.box
@@ -271,8 +263,9 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
     rng = np.random.default_rng(5)
     p = rng.uniform(-1.5, 1.5, (600, 3))
     index = np.arange(600) % mesh.faces.face_count
-    prepared = mesh.prepare(backend)
-    part = prepared.patch(backend.UInt32(index.astype(np.uint32)))
+    patches = mesh.evaluator(backend).patches
+    assert patches is not None
+    part = patches.patch(backend.UInt32(index.astype(np.uint32)))
     sample = part.evaluate(to_vector3(backend, p))
     tolerance = 2e-4 if precision == "single" else 1e-11
     for k in range(mesh.faces.face_count):
@@ -283,7 +276,7 @@ def test_a_face_in_a_lane_is_the_solid_angle_of_that_face(precision: Any) -> Non
         gradient = face.gradient(p[here], precision=precision)
         size = 1 + np.abs(gradient).max()
         np.testing.assert_allclose(to_numpy(sample.gradient)[here], gradient, atol=tolerance * size)
-        alone = face.prepare(backend).evaluate(to_vector3(backend, p[here]))
+        alone = face.evaluator(backend).evaluate(to_vector3(backend, p[here]))
         for one, mine in zip(alone.promises, sample.promises, strict=True):
             assert isinstance(one, hk.proofs.TaylorRemainder)
             assert isinstance(mine, hk.proofs.TaylorRemainder)

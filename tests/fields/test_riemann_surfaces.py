@@ -383,6 +383,7 @@ def test_other_enclosures_find_the_same_hits(enclosures: str) -> None:
 def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest: float) -> None:
     """No point of a stretch or of a disk exceeds the bound, and for one factor one attains it."""
     backend = choose_backend("double")
+    evaluator = branches.on_backend(backend)
     rng = np.random.default_rng(2)
     n = 300
     z, w = rng.normal(size=(2, n, 2)) @ [1, 1j]
@@ -395,21 +396,21 @@ def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest:
         return complex_number(*(backend.Float(one) for one in parts))
 
     def second(points: np.ndarray) -> np.ndarray:
-        found = branches.evaluate(upload(points.ravel()))
+        found = evaluator.evaluate(upload(points.ravel()))
         return np.max([to_numpy(abs(one.second)) for one in found], axis=0).reshape(points.shape)
 
     start, way, ahead = upload(z), upload(w), backend.Float(length)
     bound = to_numpy(
-        branches.second_derivative_bound(PlaneSegment(start, way, ahead, backend.Float(0)))
+        evaluator.second_derivative_bound(PlaneSegment(start, way, ahead, backend.Float(0)))
     )
     there = second(z[:, None] + w[:, None] * length[:, None] * np.linspace(0, 1, 2001)).max(axis=1)
     assert (there <= bound).all()
     assert np.max(there / bound) > sharpest * (1 - 1e-3)
-    clear = to_numpy(branches.clearance(start))
+    clear = to_numpy(evaluator.clearance(start))
     radius = rng.uniform(0, 0.95, n) * clear
     disk = Disk(start, backend.Float(radius), backend.Float(0))
     circle = z[:, None] + radius[:, None] * np.exp(1j * np.linspace(0, 2 * math.pi, 1000))
-    assert (second(circle).max(axis=1) <= to_numpy(branches.second_derivative_bound(disk))).all()
+    assert (second(circle).max(axis=1) <= to_numpy(evaluator.second_derivative_bound(disk))).all()
 
 
 def test_values_are_those_of_numpy() -> None:

@@ -285,7 +285,7 @@ def test_no_level_within_a_step(name: str, precision: Any) -> None:
     gaps = ahead * 10.0 ** rng.uniform(-2, 0.5, (2, n))
     p, along = to_vector3(backend, x), to_vector3(backend, d)
     path = Ray(p, along, choose_enclosures(None))
-    look = shape.prepare(backend).sample_ray(
+    look = shape.evaluator(backend).sample_ray(
         path, backend.Float(0), backend.Float(ahead), backend.Float(0)
     )
     blur = value_error_bound(look.sample, safe_norm(look.sample.gradient), 1.5)

@@ -244,7 +244,7 @@ def test_steps_meet_no_level_and_slightly_longer_ones_would(kind: Any) -> None:
     formula = FORMULAS["quadric"]
     p, d, h, *exact = paths("double", 4000, 5)
     field = hk.expression(formula)
-    function = FormulaOnRay(field, p, d)
+    function = FormulaOnRay(field.evaluator(choose_backend("double")), p, d)
     slope = dr.dot(field.evaluate(p).gradient, d)
     made = kind.from_restriction(function, SlopeRange(slope, slope), h)
     generator = np.random.default_rng(6)
@@ -325,7 +325,9 @@ def test_float_lanes_with_no_length_prove_nothing_false() -> None:
     made = FORMULAS["quartic"](*ParabolaBounds.along_ray(p, d, to_float(backend, [0.0, 1e-30])))
     field = hk.expression(FORMULAS["quartic"])
     enclosure = BottomUpQuadraticEnclosure.from_restriction(
-        FormulaOnRay(field, p, d), SlopeRange(0.0, 0.0), to_float(backend, [0.0, 1e-30])
+        FormulaOnRay(field.evaluator(backend), p, d),
+        SlopeRange(0.0, 0.0),
+        to_float(backend, [0.0, 1e-30]),
     )
     assert enclosure is not None
     step = enclosure.free_length(

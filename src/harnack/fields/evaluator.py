@@ -80,6 +80,12 @@ class Evaluator(abc.ABC):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
 
+    @property
+    def name(self) -> str:
+        """The name of the field's class, for messages. The default takes it from the name of the
+        evaluator's class: a `Tube` is evaluated by a `_TubeEvaluator`."""
+        return type(self).__name__.strip("_").removesuffix("Evaluator")
+
     @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p. It is called while a loop is being recorded. So use `drjit` functions
@@ -109,7 +115,7 @@ class Evaluator(abc.ABC):
         """
         del p
         raise NotImplementedError(
-            f"{type(self).__name__} gives no second derivatives: define its method hessian(p), or "
+            f"{self.name} gives no second derivatives: define its method hessian(p), or "
             'ask for what needs none, such as signed_distance(..., method="first_order")'
         )
 

@@ -332,6 +332,8 @@ class Expression(Formula):
         The errors of `expression`.
     """
 
+    literals = ("default_level",)
+
     function: Callable[[Any, Any, Any], Any]
     domain: Volume | None = None
     default_level: float = field(default=0.0, kw_only=True)
@@ -359,10 +361,6 @@ class Expression(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.function(x, y, z)
-
-    def prepare(self, backend: Any) -> Formula:
-        del backend
-        return self
 
 
 @no_derivatives

@@ -14,13 +14,14 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
+import functools
 import itertools
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, cast
 
 import drjit as dr
 
@@ -30,17 +31,22 @@ from harnack.arithmetic.jet import Dual
 from harnack.arithmetic.operators import FormulaNumber, Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmin, max_norm, safe_norm
+from harnack.backend.validation import check_no_derivatives
 from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.parabola import ConvexityEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.field import Field
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.field import Field, refuse_hidden_parameters
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.enclosures import Promise
 
+
+FormulaFunction: TypeAlias = Callable[[Any, Any, Any], Any]
+"""A formula as a function of three coordinates, which may be numbers of any arithmetic."""
 
 # Radii of the balls on which a Lipschitz constant is computed, in multiples of |f|/|grad f|; and
 # the largest radius.
@@ -80,13 +86,14 @@ class Formula(Field):
     """A field that is defined by a formula of the coordinates, its method `formula`. The formula is
     evaluated with jets: ranges of a number and of its derivatives, in interval arithmetic. So one
     evaluation gives value, gradient and rounding errors at a point; or, along a ray, proved ranges
-    of the derivatives, from which enclosures (bounds of the change of f along the ray) follow. A
-    formula "may jump" if it uses functions that are not continuous, and is "abrupt" if it may
-    change by far more than its slopes allow within the rounding of coordinates.
+    of the derivatives, from which enclosures (bounds of the change of f along the ray) follow
+    (`FormulaEvaluator`).
 
     lipschitz: a proved bound of |grad f| everywhere, for sphere tracing (enclosures="lipschitz");
         None if none is known.
     is_convex: whether f is a convex function, which lies above its tangents.
+    literals: the names of attributes whose numbers are literals of kernels, so that other numbers
+        compile another kernel. All other numbers are kernel parameters.
     """
 
     is_convex: bool = False
@@ -94,7 +101,7 @@ class Formula(Field):
     has_creases = True  # it may use abs, maximum and minimum
     over_relaxation = 1.0  # proved steps are long already; trying longer ones takes more samples
     lipschitz: Real | None = None
-    _prepared_tally: ClassVar[Tally | None] = None
+    literals: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def formula(self, x: Any, y: Any, z: Any) -> Any:
@@ -105,15 +112,69 @@ class Formula(Field):
         Dr.Jit's own operators would refuse jets.
         """
 
-    @property
-    def tally(self) -> Tally:
-        """A summary of the formula's operations: their number, and whether f may jump or is steep.
-        A prepared formula returns the summary that was made before it was prepared, when its
-        numbers were still known to Python."""
-        return tally_of(self.formula) if self._prepared_tally is None else self._prepared_tally
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        """The formula with its numbers as kernel parameters of a backend, so that a formula with
+        other numbers uses the same compiled kernel."""
+        return with_device_numbers(self, backend).formula
 
     @property
-    def is_steep(self) -> bool:
+    def tally(self) -> Tally:
+        """A summary of the formula's operations: their number, and whether f may jump or is
+        steep."""
+        return tally_of(self.formula)
+
+    @property
+    def may_jump(self) -> bool:
+        """Whether the formula uses functions that are not continuous everywhere. Also True if
+        nothing is known, because the formula refuses the special numbers with which its operations
+        are counted (`Tally`)."""
+        return self.tally.may_jump
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        """The evaluator of the formula, with its numbers as kernel parameters of the backend."""
+        del plan
+        numbers = with_device_numbers(self, backend)
+        return FormulaEvaluator(self, numbers.formula, numbers.lipschitz)
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p, by the formula with its Python numbers, which become literals of the
+        kernel."""
+        return FormulaEvaluator(self, self.formula, self.lipschitz).evaluate(p)
+
+
+@dataclass(frozen=True, eq=False)
+class FormulaEvaluator(Evaluator):
+    """The evaluator of a formula. A formula "may jump" if it uses functions that are not
+    continuous, and is "abrupt" if it may change by far more than its slopes allow within the
+    rounding of coordinates.
+
+    field: the formula's field, with Python numbers.
+    formula: f as a function of three coordinates, with the numbers of the backend.
+    lipschitz: a proved bound of |grad f| everywhere, as a number of the backend or of Python; None
+        if none is known.
+    """
+
+    field: Formula
+    formula: FormulaFunction
+    lipschitz: Real | None
+
+    @property
+    def name(self) -> str:
+        """The name of the field's class, for messages."""
+        return type(self.field).__name__
+
+    @functools.cached_property
+    def tally(self) -> Tally:
+        """The field's summary of the formula's operations."""
+        return self.field.tally
+
+    @functools.cached_property
+    def may_jump(self) -> bool:
+        """Whether f may jump, by what the field knows of the formula."""
+        return self.field.may_jump
+
+    @property
+    def is_steep(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether the formula uses an operation that may have a vertical tangent or a pole, or f
         changes so fast that it acts like a pole within the rounding of coordinates
         (`is_abrupt`)."""
@@ -138,9 +199,16 @@ class Formula(Field):
 
     def evaluate(self, p: Vec3) -> Sample:
         sample = self._with_one_sided_gradient(p, self.sample_without_alternatives(p))
+        # Derivatives of the value that do not come from p would be lost.
+        if not dr.grad_enabled(p):
+            check_no_derivatives(self.name, sample.value)
         if _WITHOUT_ALTERNATIVES.get():
             return sample
         return dataclasses.replace(sample, alternative_promises=self._local_lipschitz(p, sample))
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        refuse_hidden_parameters(self.field)
+        return super().differentiable_value(p)
 
     def _with_one_sided_gradient(self, p: Vec3, sample: Sample) -> Sample:
         """The sample at p, where the gradient is that of one side if p lies on a tie of the
@@ -193,7 +261,7 @@ class Formula(Field):
     def sample_without_alternatives(self, p: Vec3) -> Sample:
         """The sample at p with the proved bounds of `promises` only. Samples on rays use no
         others."""
-        return self._sample_of(self._jet(Jet.at_point(p), p.x), p)
+        return self._sample_of(self._jet(Jet.at_point(p)), p)
 
     def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
         """The sample at p, made from `jet`, the jet of f at p. Value and gradient are the midpoints
@@ -222,8 +290,7 @@ class Formula(Field):
         promises: list[Lipschitz] = []
         for multiple in _RADII:
             radius = fmin(multiple * newton_length, _MAX_RADIUS)
-            # (`_jet` does not use its second argument.)
-            jet = self._jet(Jet.over_ball(p, radius), p.x)
+            jet = self._jet(Jet.over_ball(p, radius))
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
             # A bound of the length of the gradient, from bounds of its components, and enlarged for
             # rounding.
@@ -240,7 +307,7 @@ class Formula(Field):
         return () if self.lipschitz is None else (Lipschitz(0 * p.x + self.lipschitz),)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        jet = self._jet(Jet.at_point(p, order=2), p.x)
+        jet = self._jet(Jet.at_point(p, order=2))
         xx, xy, xz, yy, yz, zz = (0 * p.x + entry.midpoint for entry in jet.second_derivatives)
         vector = cast("Any", type(p))
         return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
@@ -249,7 +316,7 @@ class Formula(Field):
         """Two error bounds at p: of the gradient, as stated in the sample, and of the Hessian. The
         latter follows from the ranges of the second derivatives, which include rounding and ties of
         the formula."""
-        return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2), p.x), p.x)
+        return sample.gradient_error, hessian_error(self._jet(Jet.at_point(p, order=2)), p.x)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, with enclosures (proved bounds of the
@@ -284,8 +351,7 @@ class Formula(Field):
         """
         del back
         p = path.point(t)
-        # The jet of f at p. (`_jet` does not use its second argument.)
-        jet = self._jet(Jet.at_point(p), p.x)
+        jet = self._jet(Jet.at_point(p))
         sample = self._sample_of(jet, p)
         slope, slope_error = self._slope(p, path.direction)
         slopes = SlopeRange.around(slope, slope_error)
@@ -311,7 +377,7 @@ class Formula(Field):
         # from the kinds that examine a given length, before the one is added that holds on all
         # lengths.
         growth = max(entry.reach_growth for entry in enclosures)
-        if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
+        if self.field.is_convex and ConvexityEnclosure in path.proofs.kinds:
             enclosures = (*enclosures, ConvexityEnclosure(slopes))
         # A lower bound of |grad f|, from lower bounds of its components. (0 * p.x turns Python
         # numbers into Dr.Jit arrays.)
@@ -344,36 +410,18 @@ class Formula(Field):
 
         x, y, z = (coordinate(k) for k in range(3))
         # There is one variable, the length along the direction, and so one derivative.
-        (slope,) = self._jet((x, y, z), p.x).first_derivatives
+        (slope,) = self._jet((x, y, z)).first_derivatives
         return zero + slope.midpoint, zero + slope.radius
-
-    @property
-    def may_jump(self) -> bool:
-        """Whether the formula uses functions that are not continuous everywhere. Also True if
-        nothing is known, because the formula refuses the special numbers with which its operations
-        are counted (`Tally`)."""
-        return self.tally.may_jump
 
     def restrict(self, p: Vec3, direction: Vec3) -> FormulaOnRay:
         """The formula restricted to the line p + s direction, as a function of the length s, from
         which enclosures are made."""
         return FormulaOnRay(self, p, direction)
 
-    def prepare(self, backend: Backend) -> Field:
-        """The same formula with its numbers as kernel parameters, so that a formula with other
-        numbers uses the same compiled kernel."""
-        other = with_device_numbers(self, backend)
-        object.__setattr__(other, "_prepared_tally", self.tally)
-        return other
-
-    def _jet(self, coordinates: tuple[Jet, Jet, Jet], like: Real) -> Jet:
+    def _jet(self, coordinates: tuple[Jet, Jet, Jet]) -> Jet:
         """The jet of f (ranges of its value and derivatives) from the jets of the three
-        coordinates.
-
-        coordinates: the jets of x, y and z.
-        like: not used.
-        """
-        return as_jet(self.formula(*coordinates), coordinates[0], type(self).__name__)
+        coordinates."""
+        return as_jet(self.formula(*coordinates), coordinates[0], self.name)
 
 
 def probe_jets() -> tuple[Jet, Jet, Jet]:
@@ -457,7 +505,7 @@ class FormulaOnRay:
     into pieces at given lengths, the knots. For each piece, jets give proved ranges of F' and F''.
     Enclosures (bounds of the change of f along a ray) are made from it.
 
-    field: the field with the formula.
+    evaluator: the evaluator of the formula.
     p, direction: (3,) p and d.
     before: the distance before p at which the first piece begins. If it is not 0.0, the pieces
         cover all lines along d that lead through p up to rounding.
@@ -466,7 +514,7 @@ class FormulaOnRay:
         samples, but twice the time.
     """
 
-    field: Formula
+    evaluator: FormulaEvaluator
     p: Vec3
     direction: Vec3
     before: Real = 0.0
@@ -514,29 +562,38 @@ class FormulaOnRay:
         # If the first piece begins before p, the jets hold for all lines along d through points
         # that round to p.
         coordinates = Jet.along_ray(self.p, self.direction, start, end, is_rounded=not is_exact)
-        return as_jet(self.field.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        return as_jet(self.evaluator.formula(*coordinates), coordinates[0], self.evaluator.name)
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
     """A copy of a field that is a dataclass, in which its numbers are kernel parameters of the
-    backend, and its attributes that are fields are prepared. (A kernel parameter can change without
-    compiling the kernel again.)"""
+    backend, and the formulas of its attributes that are fields are those on the backend
+    (`Formula.formula_on`). (A kernel parameter can change without compiling the kernel again.)
+    Attributes that are named in `Formula.literals` are left as they are."""
     other = copy.copy(field)
+    literals: tuple[str, ...] = getattr(field, "literals", ())
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():
         value = getattr(field, entry.name)
-        if (prepared := prepare_value(value, backend)) is not value:
+        ready = value if entry.name in literals else on_backend(value, backend)
+        if ready is not value:
             # The dataclass may be frozen.
-            object.__setattr__(other, entry.name, prepared)
+            object.__setattr__(other, entry.name, ready)
     return other
 
 
-def prepare_value(value: Any, backend: Backend) -> Any:
+def on_backend(value: Any, backend: Backend) -> Any:
     """The value of a field's attribute, ready for the backend. A float, or each float in a tuple,
-    becomes a kernel parameter. A field is prepared. All else, integers included, is returned
-    unchanged."""
+    becomes a kernel parameter. A field becomes a copy whose formula is that on the backend. All
+    else, integers included, is returned unchanged."""
     if isinstance(value, float):
         return dr.opaque(backend.Float, value)
     if isinstance(value, tuple):
         entries = cast("tuple[Any, ...]", value)
-        return tuple(prepare_value(entry, backend) for entry in entries)
-    return value.prepare(backend) if isinstance(value, Field) else value
+        return tuple(on_backend(entry, backend) for entry in entries)
+    if isinstance(value, Formula) and type(value).formula_on is Formula.formula_on:
+        return with_device_numbers(value, backend)
+    if isinstance(value, Field) and hasattr(value, "formula_on"):
+        other = copy.copy(value)
+        object.__setattr__(other, "formula", cast("Any", value).formula_on(backend))
+        return other
+    return value

@@ -5,28 +5,24 @@ box of its own. A ray is traced only along the patches whose boxes it enters."""
 from __future__ import annotations
 
 import abc
-import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, ClassVar, NoReturn
 
 import numpy as np
 
-from harnack.cluster.serialization import TransientCache
-from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.capabilities import PatchEntry, Patches
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field
 from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single
 from harnack.geometry import Box
 from harnack.tree.closest_triangles import BoxTree
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from harnack.backend import Backend, FloatArray, Mask, Real, Vec3
     from harnack.geometry import Volume
 
-__all__ = ["PatchBoxes", "PatchField"]
+__all__ = ["PatchBoxes", "PatchField", "PatchesInBoxes"]
 
 
 @dataclass(frozen=True)
@@ -71,82 +67,73 @@ class PatchBoxes(UnitFrame):
         return PatchEntry(enter * self.size, leave * self.size, box)
 
 
-class HasPatchBoxes(Protocol):
-    """The data of a union of patches on a backend: the boxes of the patches, and further data that
-    a field chooses."""
+@dataclass(frozen=True)
+class PatchesInBoxes(Patches):
+    """The patches of a surface on a backend, each in a box of its own. Subclasses add the data of
+    the functions whose level sets the patches are, and define `patch`.
 
-    @property
-    def boxes(self) -> PatchBoxes: ...
-
-
-_Buffers = TypeVar("_Buffers", bound=HasPatchBoxes)
-
-
-class PatchField(Field, Patches, Generic[_Buffers]):
-    """A field whose surface is a union of patches. Each patch is a level set of a function of its
-    own, and lies in a box of its own. The boxes depend on the levels. A prepared field has its data
-    (boxes and functions) on a backend.
-
-    levels: the levels whose patches lie in the boxes of the prepared field.
+    boxes: the boxes of the patches.
     """
 
-    @property
-    def patches(self) -> Patches | None:
-        return self
+    boxes: PatchBoxes
 
-    def __init__(self) -> None:
-        self.levels: tuple[float, ...] = (self.default_level,)
-        self._for_levels: TransientCache[tuple[float, ...], Self] = TransientCache()
-        self._device: _Buffers | None = None
+    def next_entry(
+        self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
+    ) -> PatchEntry:
+        return self.boxes.next(o, d, after, start, end, active)
+
+
+class PatchField(Field):
+    """A field whose surface is a union of patches. Each patch is a level set of a function of its
+    own, and lies in a box of its own. The boxes depend on the levels.
+
+    no_single_function: the message of the error that is raised if the field itself is evaluated.
+    """
+
+    no_single_function: ClassVar[str]
+    has_patches = True
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
         """The lowest and the highest corners of the boxes of all patches, two arrays (m, 3). Each
         box is proved to contain its patch.
 
-        levels: the levels whose patches are meant; None for the attribute `levels`.
+        levels: the levels whose patches are meant; None for the default level.
         """
 
     @abc.abstractmethod
-    def _upload(self, backend: Backend) -> _Buffers:
-        """Upload the boxes and the data of the patches to a backend, and return them."""
+    def _upload(self, backend: Backend, levels: tuple[float, ...]) -> PatchesInBoxes:
+        """Upload the boxes and the data of the patches to a backend, and return them.
 
-    def with_levels(self, levels: tuple[float, ...]) -> Self:
-        """This field with boxes that contain the patches of these levels, not yet prepared for a
-        backend. Equal levels give the same object."""
-        if levels == self.levels:
-            return self
-        if levels not in self._for_levels:
-            other = copy.copy(self)
-            other.levels = levels
-            self._for_levels[levels] = other
-        return self._for_levels[levels]
-
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Self:
-        if self._device is not None and self._device.boxes.backend is backend:
-            return self
-        prepared = copy.copy(self)
-        prepared._device = self._upload(backend)
-        return prepared
-
-    def _require_data(self) -> _Buffers:
-        """The boxes and the data of the patches, which `prepare` uploaded.
-
-        Raises:
-            RuntimeError: `prepare` was not called.
+        levels: the levels whose patches lie in the boxes.
         """
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
 
-    def next_entry(
-        self, o: Vec3, d: Vec3, after: PatchEntry, start: Real, end: Real, active: Mask
-    ) -> PatchEntry:
-        return self._require_data().boxes.next(o, d, after, start, end, active)
+    def evaluate(self, p: Vec3) -> NoReturn:
+        """Not defined, as each patch has a function of its own. Always raises TypeError."""
+        del p
+        raise TypeError(self.no_single_function)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of the patches, with boxes that contain them for the levels of the plan; or
+        for the default level, if it has none."""
+        patches = self._upload(backend, plan.levels or (self.default_level,))
+        return _PatchFieldEvaluator(patches, self.no_single_function)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A box that contains the patches of these levels: the box around the boxes of all patches.
         It is never None."""
         lower, upper = self.boxes(levels)
         return Box(lower.min(axis=0), upper.max(axis=0))
+
+
+class _PatchFieldEvaluator(Evaluator):
+    """The evaluator of a `PatchField`, which has patches and nothing else."""
+
+    def __init__(self, patches: PatchesInBoxes, no_single_function: str) -> None:
+        """patches: the patches. no_single_function: the message of `evaluate`."""
+        self.patches, self._no_single_function = patches, no_single_function
+
+    def evaluate(self, p: Vec3) -> NoReturn:
+        """Not defined, as each patch has a function of its own. Always raises TypeError."""
+        del p
+        raise TypeError(self._no_single_function)

@@ -231,5 +231,5 @@ def _value(function: FormulaOnRay) -> Interval:
 def _evaluate(function: FormulaOnRay, coordinates: tuple[Any, Any, Any]) -> Any:
     """Return the value of a formula at coordinates that are numbers of any arithmetic, as a number
     of that arithmetic."""
-    value = function.field.formula(*coordinates)
+    value = function.evaluator.formula(*coordinates)
     return coordinates[0].constant(float(value)) if isinstance(value, int | float) else value

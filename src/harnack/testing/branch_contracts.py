@@ -7,7 +7,7 @@ a single value."""
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -72,9 +72,9 @@ def _check_branch_point(
     x, y = point.location.real + radii * np.cos(angle), point.location.imag + radii * np.sin(angle)
     # Computed again from the rounded points.
     radii = np.hypot(x - point.location.real, y - point.location.imag)
-    branches: Any = field.branches.prepare(backend)
+    branches = field.branches.on_backend(backend)
     imaginary = field.part == "imag"
-    period: float | None = branches.period(imaginary)
+    period = field.branches.period(imaginary)
     value = point.value.imag if imaginary else point.value.real
     bound = point.constant * radii**point.power
     # The largest difference of any branch from the stated value, at each point; NaN if a branch is

@@ -15,6 +15,7 @@ import contextlib
 import dataclasses
 import functools
 import gc
+import inspect
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -256,5 +257,7 @@ def _find_arrays(data: Any) -> Iterator[Any]:
             pending += node.values()
         elif isinstance(node, list | tuple):
             pending += node
+        elif inspect.ismethod(node):
+            pending.append(node.__self__)
         elif dataclasses.is_dataclass(node) or hasattr(node, "__dict__"):
             pending += vars(node).values()

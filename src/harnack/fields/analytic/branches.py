@@ -11,7 +11,7 @@ from __future__ import annotations
 import abc
 import importlib
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -105,7 +105,7 @@ class BranchPoint:
 
 
 @dataclass(frozen=True)
-class PreparedBranchPoint:
+class DeviceBranchPoint:
     """A `BranchPoint` with Dr.Jit numbers: a point of the complex plane where a branch g of a
     function is not analytic, with a bound of the branches near it.
 
@@ -121,19 +121,13 @@ class PreparedBranchPoint:
     value: Complex
 
     @classmethod
-    def of(
-        cls, point: BranchPoint, make_real: Callable[[float], Real], make_complex: Any
-    ) -> PreparedBranchPoint:
-        """Convert a branch point to Dr.Jit numbers.
-
-        make_real: makes a real Dr.Jit number from a Python float.
-        make_complex: makes a complex Dr.Jit number from its real and its imaginary part.
-        """
-        at, value = (
-            make_complex(make_real(z.real), make_real(z.imag))
-            for z in (point.location, point.value)
+    def upload(cls, backend: Backend, point: BranchPoint) -> DeviceBranchPoint:
+        """The branch point with numbers of a backend that are no literals."""
+        at, value = _uploaded((point.location, point.value), backend)
+        constant, radius = (
+            dr.opaque(backend.Float, number) for number in (point.constant, point.radius)
         )
-        return cls(at, point.power, make_real(point.constant), make_real(point.radius), value)
+        return cls(at, point.power, constant, radius, value)
 
 
 @dataclass(frozen=True)
@@ -148,8 +142,8 @@ class Branch:
 
 class PlaneRegion(abc.ABC):
     """A region of the complex plane, on which second derivatives of analytic functions are bounded
-    (`Branches.second_derivative_bound`). The bounds need only its distances from singular points,
-    and a disk around it. All numbers are rounded to the safe side: they hold for the exact
+    (`BranchEvaluator.second_derivative_bound`). The bounds need only its distances from singular
+    points, and a disk around it. All numbers are rounded to the safe side: they hold for the exact
     region."""
 
     @abc.abstractmethod
@@ -228,14 +222,7 @@ class Branches(abc.ABC):
     takes near a point, continued analytically), and proved bounds of them. Either the real or the
     imaginary part of g is drawn. Branches whose drawn parts differ by whole periods count as one. A
     singular point, also called a branch point here, is one where a branch is not analytic.
-
-    _prepared: the singular points as Dr.Jit numbers of a backend; empty unless `prepare` has made
-        them.
     """
-
-    _prepared: tuple[PreparedBranchPoint, ...] = field(
-        default=(), kw_only=True, repr=False, compare=False
-    )
 
     @property
     @abc.abstractmethod
@@ -257,34 +244,27 @@ class Branches(abc.ABC):
         """The number of branches. Those whose drawn parts differ by whole periods count as one."""
         return 1
 
-    def prepare(self, backend: Backend) -> Branches:
-        """A copy of these branches whose numbers lie on the backend as data, not as literals:
-        Dr.Jit then need not compile its code again for other numbers."""
+    @abc.abstractmethod
+    def on_backend(self, backend: Backend) -> BranchEvaluator:
+        """The object that evaluates these branches on a backend."""
 
-        def number(value: float) -> Real:
-            """The number as a Dr.Jit array that is not a literal."""
-            return dr.opaque(backend.Float, value)
+    def max_abs(self, center: complex, radius: float) -> float:
+        """An upper bound of |g|, for all branches g, on the disk with this center and radius;
+        infinite if no bound is known."""
+        del center, radius
+        return math.inf
 
-        make_complex = complex_type(backend)
-        return replace(
-            self,
-            _prepared=tuple(
-                PreparedBranchPoint.of(point, number, make_complex) for point in self.branch_points
-            ),
-        )
 
-    def points_on(self, z: Complex) -> tuple[PreparedBranchPoint, ...]:
-        """The singular points as Dr.Jit numbers of the types of z: those that `prepare` has made,
-        else literals.
+@dataclass(frozen=True, eq=False)
+class BranchEvaluator(abc.ABC):
+    """An analytic function of a complex variable z with all its branches g, to be evaluated on a
+    backend. Its numbers lie there as data, not as literals: Dr.Jit then need not compile its code
+    again for other numbers.
 
-        z: any complex number; it tells the types.
-        """
-        if self._prepared:
-            return self._prepared
-        real, make_complex = cast("Any", type(z.real)), cast("Any", type(z))
-        return tuple(
-            PreparedBranchPoint.of(point, real, make_complex) for point in self.branch_points
-        )
+    points: the singular points, where a branch is not analytic.
+    """
+
+    points: tuple[DeviceBranchPoint, ...]
 
     @abc.abstractmethod
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
@@ -306,7 +286,7 @@ class Branches(abc.ABC):
             point than this (plus 1e-12), it is replaced by a point at that distance.
         """
         min_distance = rounding + _MIN_DISTANCE
-        for point in self.points_on(z):
+        for point in self.points:
             moved = type(z)(point.at.real + min_distance, point.at.imag)
             z = dr.select(abs(z - point.at) < min_distance, moved, z)
         return z
@@ -314,16 +294,10 @@ class Branches(abc.ABC):
     def clearance(self, z: Complex) -> Real:
         """The distance from z to the nearest singular point. If there are no singular points, the
         result is 2, since it limits the size of the disks on which the branches are bounded."""
-        nearest = 0 * z.real + (dr.inf if self.branch_points else _CLEARANCE_WITHOUT_POINTS)
-        for point in self.points_on(z):
+        nearest = 0 * z.real + (dr.inf if self.points else _CLEARANCE_WITHOUT_POINTS)
+        for point in self.points:
             nearest = fmin(abs(z - point.at), nearest)
         return nearest
-
-    def max_abs(self, center: complex, radius: float) -> float:
-        """An upper bound of |g|, for all branches g, on the disk with this center and radius;
-        infinite if no bound is known."""
-        del center, radius
-        return math.inf
 
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """A bound of the rounding error of the values of all branches, as a multiple of the machine
@@ -363,7 +337,6 @@ class PowerProduct(Branches):
     centers: tuple[complex, ...]
     exponents: tuple[float, ...]
     denominator: int
-    _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def count(self) -> int:
@@ -398,13 +371,37 @@ class PowerProduct(Branches):
             points.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
         return tuple(points)
 
-    def prepare(self, backend: Backend) -> Branches:
-        return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
+    def on_backend(self, backend: Backend) -> BranchEvaluator:
+        points = _device_points(self.branch_points, backend)
+        centers = _uploaded(self.centers, backend)
+        return _PowerProductEvaluator(points, centers, self.exponents, self.denominator)
 
-    def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: those that `prepare` has made, else
-        literals."""
-        return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
+    def max_abs(self, center: complex, radius: float) -> float:
+        """An upper bound of |g| on the disk with this center and radius: the product of bounds of
+        all factors |z - a_i|^alpha_i. It is infinite if the disk contains an a_i with a negative
+        exponent."""
+        product = 1.0
+        for a, alpha in zip(self.centers, self.exponents, strict=True):
+            distance = abs(a - center)
+            if alpha < 0 and distance <= radius:
+                return math.inf
+            # The largest distance if alpha is positive, else the smallest one.
+            product *= (distance + math.copysign(radius, alpha)) ** alpha
+        return product
+
+
+@dataclass(frozen=True, eq=False)
+class _PowerProductEvaluator(BranchEvaluator):
+    """The branches of a `PowerProduct`, which has the bound of |g"|, on a backend.
+
+    centers: the points a_i.
+    exponents: the exponents alpha_i, in the same order.
+    denominator: q, the number of branches.
+    """
+
+    centers: tuple[Complex, ...]
+    exponents: tuple[float, ...]
+    denominator: int
 
     def move_off_singularities(self, z: Complex, rounding: Real) -> Complex:
         """The point z, or a point beside it if z is at a singular point or at a zero of g.
@@ -417,7 +414,7 @@ class PowerProduct(Branches):
         """
         z = super().move_off_singularities(z, rounding)
         unit = 4 * float(dr.epsilon(z.real))
-        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+        for a, alpha in zip(self.centers, self.exponents, strict=True):
             if alpha > 0 and alpha.is_integer():
                 min_distance = _MIN_ZERO_DISTANCE + unit * fmax(dr.abs(a.real), dr.abs(a.imag))
                 moved = type(z)(a.real + min_distance, a.imag)
@@ -435,7 +432,7 @@ class PowerProduct(Branches):
         log_size, angle = 0 * z.real, 0 * z.real
         log_derivative = type(z)(log_size, log_size)
         square_sum = log_derivative
-        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+        for a, alpha in zip(self.centers, self.exponents, strict=True):
             offset = z - a
             log_size = log_size + alpha * dr.log(abs(offset))
             angle = angle + alpha * dr.atan2(offset.imag, offset.real)
@@ -462,8 +459,7 @@ class PowerProduct(Branches):
         """
         log_nearest: list[Real] = []
         log_farthest: list[Real] = []
-        # `disk` returns center and radius. Here they only tell the types of Dr.Jit numbers.
-        for a in self._centers(part.disk()[0]):
+        for a in self.centers:
             smallest, largest = part.distances(a)
             log_nearest.append(dr.log(smallest))
             log_farthest.append(dr.log(largest))
@@ -485,19 +481,6 @@ class PowerProduct(Branches):
                 bound = bound + factor * dr.exp(sum(logs)) if logs else factor
         return bound * _BOUND_MARGIN
 
-    def max_abs(self, center: complex, radius: float) -> float:
-        """An upper bound of |g| on the disk with this center and radius: the product of bounds of
-        all factors |z - a_i|^alpha_i. It is infinite if the disk contains an a_i with a negative
-        exponent."""
-        product = 1.0
-        for a, alpha in zip(self.centers, self.exponents, strict=True):
-            distance = abs(a - center)
-            if alpha < 0 and distance <= radius:
-                return math.inf
-            # The largest distance if alpha is positive, else the smallest one.
-            product *= (distance + math.copysign(radius, alpha)) ** alpha
-        return product
-
     def value_rounding(self, z: Complex, branches: tuple[Branch, ...]) -> Real:
         """A bound of the rounding error of the values of all branches at z, as a multiple of the
         machine epsilon.
@@ -508,7 +491,7 @@ class PowerProduct(Branches):
         roundings of the terms of these sums. All branches have the same absolute value.
         """
         roundings = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
-        for a, alpha in zip(self._centers(z), self.exponents, strict=True):
+        for a, alpha in zip(self.centers, self.exponents, strict=True):
             roundings = roundings + 4 * abs(alpha) * dr.abs(dr.log(abs(z - a)))
         return roundings * abs(branches[0].value)
 
@@ -528,7 +511,6 @@ class Logarithm(Branches):
 
     centers: tuple[complex, ...] = (0j,)
     multiplicities: tuple[int, ...] = (1,)
-    _on: tuple[Complex, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def branch_points(self) -> tuple[BranchPoint, ...]:
@@ -537,20 +519,28 @@ class Logarithm(Branches):
     def period(self, imaginary: bool) -> float | None:
         return 2 * math.pi * math.gcd(*self.multiplicities) if imaginary else None
 
-    def prepare(self, backend: Backend) -> Branches:
-        return replace(super().prepare(backend), _on=_uploaded(self.centers, backend))
+    def on_backend(self, backend: Backend) -> BranchEvaluator:
+        points = _device_points(self.branch_points, backend)
+        return _LogarithmEvaluator(points, _uploaded(self.centers, backend), self.multiplicities)
 
-    def _centers(self, z: Complex) -> tuple[Complex, ...]:
-        """The points a_i as Dr.Jit numbers of the type of z: those that `prepare` has made, else
-        literals."""
-        return self._on or tuple(type(z)(a.real, a.imag) for a in self.centers)
+
+@dataclass(frozen=True, eq=False)
+class _LogarithmEvaluator(BranchEvaluator):
+    """The only branch of a `Logarithm`, which has the bound of |g"|, on a backend.
+
+    centers: the points a_i.
+    multiplicities: the integers n_i, in the same order.
+    """
+
+    centers: tuple[Complex, ...]
+    multiplicities: tuple[int, ...]
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         """g = sum n_i log(z - a_i) at z, as a tuple with a single branch: all other values differ
         from it by whole periods."""
         zero = type(z)(0 * z.real, 0 * z.real)
         value, first, second = zero, zero, zero
-        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
+        for a, n in zip(self.centers, self.multiplicities, strict=True):
             offset = z - a
             inverse = dr.rcp(offset)
             value = value + n * type(z)(dr.log(abs(offset)), dr.atan2(offset.imag, offset.real))
@@ -560,7 +550,7 @@ class Logarithm(Branches):
 
     def second_derivative_bound(self, part: PlaneRegion) -> Real:
         total = 0 * part.disk()[1]
-        for a, n in zip(self._centers(part.disk()[0]), self.multiplicities, strict=True):
+        for a, n in zip(self.centers, self.multiplicities, strict=True):
             total = total + abs(n) / dr.square(part.distances(a)[0])
         return total * _BOUND_MARGIN
 
@@ -573,7 +563,7 @@ class Logarithm(Branches):
         """
         del branches
         roundings = 0 * z.real
-        for a, n in zip(self._centers(z), self.multiplicities, strict=True):
+        for a, n in zip(self.centers, self.multiplicities, strict=True):
             roundings = roundings + abs(n) * (8 * math.pi + 4 * dr.abs(dr.log(abs(z - a))))
         return roundings
 
@@ -603,6 +593,14 @@ class ArcSine(Branches):
 
     def period(self, imaginary: bool) -> float | None:
         return None if imaginary else 2 * math.pi
+
+    def on_backend(self, backend: Backend) -> BranchEvaluator:
+        return _ArcSineEvaluator(_device_points(self.branch_points, backend))
+
+
+@dataclass(frozen=True, eq=False)
+class _ArcSineEvaluator(BranchEvaluator):
+    """The branches of an `ArcSine`, which has the bound of |g"|, on a backend."""
 
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         """The two branches g and pi - g of asin at z, where g is the principal branch, by Kahan's
@@ -657,6 +655,23 @@ class UserBranches(Branches):
         del imaginary
         return self.shift
 
+    def on_backend(self, backend: Backend) -> BranchEvaluator:
+        points = _device_points(self.branch_points, backend)
+        return _UserBranchEvaluator(points, self.function, self.second_bound)
+
+
+@dataclass(frozen=True, eq=False)
+class _UserBranchEvaluator(BranchEvaluator):
+    """The branches that a user has written (`UserBranches`), on a backend.
+
+    function: a function of z that returns all branches at z, each as (g, g') or (g, g', g").
+    second_bound: a function of z and r that returns a bound of |g"| on the disk of radius r about
+        z, for all branches g.
+    """
+
+    function: Callable[[Any], Any]
+    second_bound: Callable[[Any, Any], Any]
+
     def evaluate(self, z: Complex) -> tuple[Branch, ...]:
         """The branches at z that the user's function returns; Python numbers among them are
         converted to Dr.Jit numbers."""
@@ -676,10 +691,17 @@ class UserBranches(Branches):
         center, radius = part.disk()
         # False if the radius is NaN.
         is_free = radius == radius
-        for point in self.points_on(center):
+        for point in self.points:
             is_free = is_free & (abs(center - point.at) > radius)
         bound = 0 * radius + self.second_bound(center, radius)
         return dr.select(is_free & (bound >= 0), bound, dr.inf)
+
+
+def _device_points(
+    points: tuple[BranchPoint, ...], backend: Backend
+) -> tuple[DeviceBranchPoint, ...]:
+    """The branch points on a backend."""
+    return tuple(DeviceBranchPoint.upload(backend, point) for point in points)
 
 
 def _uploaded(points: tuple[complex, ...], backend: Backend) -> tuple[Complex, ...]:

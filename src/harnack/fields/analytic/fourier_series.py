@@ -6,7 +6,6 @@ only to measure by how much the series differs from it."""
 
 from __future__ import annotations
 
-import copy
 import math
 import operator
 from collections.abc import Callable
@@ -16,11 +15,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend import backend_of
 from harnack.backend.validation import as_real_array
 from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
 from harnack.fields.analytic.waves import mean_wavelength
-from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.batched_fields import cached_upload
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Box
 
@@ -120,7 +119,6 @@ class FourierSeries(Field):
         )
         self._rounding = _rounding(checked, self._size)
         self._source: Function | FloatArray | None = None
-        self._device: CosineSums | None = None
 
     @classmethod
     def fit(
@@ -273,51 +271,17 @@ class FourierSeries(Field):
             values = grid.ravel()
         return float(np.abs(self.value(points, precision="double") - values).max())
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Self:
-        """The same field with its coefficients and bounds uploaded to the backend; the field itself
-        if they are there already."""
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
-        prepared._device = self._upload(backend)
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        del plan
+        return _SeriesEvaluator(self._upload(backend))
 
+    @cached_upload
     def _upload(self, backend: Backend) -> CosineSums:
         """The coefficients and bounds of the series, uploaded to a backend, in an object that
         evaluates it."""
         return CosineSums.upload(
             backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
         )
-
-    def _on(self, p: Vec3) -> CosineSums:
-        """The uploaded coefficients and bounds of the series, on the backend of p. They are
-        uploaded now unless `prepare` has done so."""
-        return self._upload(backend_of(p)) if self._device is None else self._device
-
-    def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: value and gradient of the series, bounds of their rounding errors, and
-        proved bounds of second derivatives on balls about p."""
-        series = self._on(p)
-        value, gradient = series.value(p)
-        roundoff = float(dr.epsilon(type(value))) * _SECOND_ORDER
-        # The rounding of an angle, (p - lower) pi/size, moves the point: three roundings of p -
-        # lower (of the difference, of pi/size and of the product), and that of `lower`.
-        moves = [
-            dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
-        ]
-        error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
-        # Entry 0 of `rounding` is for the value, entry 1 for the gradient.
-        error = roundoff * (error + series.rounding[0])
-        move_length = dr.norm(series.backend.Array3f(*moves))
-        # A move of the point changes the gradient by at most the bound of second derivatives times
-        # the length.
-        slope_error = roundoff * dr.fma(series.curvature, move_length, series.rounding[1])
-        return Sample(value, gradient, series.curvatures(p), error, slope_error)
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of the series at p."""
-        return self._on(p).hessian(p)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The box around all cells in which the series may take one of the levels; the whole box if
@@ -346,6 +310,40 @@ class FourierSeries(Field):
             "grids of local bounds": tuple(cells.count for cells in self._bounds.cells),
             "error of the fit": self.fit_error,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class _SeriesEvaluator(Evaluator):
+    """The evaluator of a `FourierSeries`, which has the proofs.
+
+    series: the coefficients and bounds of the series on the backend.
+    """
+
+    series: CosineSums
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value and gradient of the series, bounds of their rounding errors, and
+        proved bounds of second derivatives on balls about p."""
+        series = self.series
+        value, gradient = series.value(p)
+        roundoff = float(dr.epsilon(type(value))) * _SECOND_ORDER
+        # The rounding of an angle, (p - lower) pi/size, moves the point: three roundings of p -
+        # lower (of the difference, of pi/size and of the product), and that of `lower`.
+        moves = [
+            dr.fma(3.0, dr.abs(p[k] - series.lower[k]), dr.abs(series.lower[k])) for k in range(3)
+        ]
+        error = sum((moves[k] * dr.abs(gradient[k]) for k in range(3)), 0 * p.x)
+        # Entry 0 of `rounding` is for the value, entry 1 for the gradient.
+        error = roundoff * (error + series.rounding[0])
+        move_length = dr.norm(series.backend.Array3f(*moves))
+        # A move of the point changes the gradient by at most the bound of second derivatives times
+        # the length.
+        slope_error = roundoff * dr.fma(series.curvature, move_length, series.rounding[1])
+        return Sample(value, gradient, series.curvatures(p), error, slope_error)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the Hessian of the series at p."""
+        return self.series.hessian(p)
 
 
 def _as_triple(numbers: Any, name: str) -> tuple[int, int, int]:

@@ -39,12 +39,13 @@ from harnack.fields.analytic.sphere_bounds import (
     hessian_bound,
     value_bound,
 )
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, validate_levels_in_range
 from harnack.fields.parameters import record_call
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.geometry.volume import Volume
 
 __all__ = ["HypersphericalHarmonic"]
@@ -222,10 +223,10 @@ class HypersphericalHarmonic(Field):
         """
         self.domain = domain
         self.degree = l
-        self._orders = [
+        self._orders = tuple(
             _OrderTerm.of(l, j, harmonic_weights)
             for j, harmonic_weights in weights_by_order(l, weights).items()
-        ]
+        )
         self._range = HypersphereRange.of(l, weights)
 
     @property
@@ -233,14 +234,61 @@ class HypersphericalHarmonic(Field):
         """The ends (low, high) of an interval that is proved to contain all values of f."""
         return self._range.low, self._range.high
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        del backend, plan
+        return _HypersphericalEvaluator(self.degree, self._orders, self._range)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """The domain or, if there is none, a ball about the origin that contains the level sets;
+        None if they may be unbounded.
+
+        levels: the levels of f.
+        """
+        if self.domain is not None:
+            return self.domain
+        radius = max((self._range.radius(level) for level in levels), default=0.0)
+        return Ball(radius=radius) if 0 < radius < math.inf else None
+
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        """Raise ValueError for a level outside of the proved range of f, and for a constant f."""
+        if self.degree == 0:
+            raise ValueError(
+                "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
+            )
+        validate_levels_in_range(levels, self.value_range)
+
+    def describe(self) -> dict[str, Any]:
+        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
+        return {
+            "degree": self.degree,
+            "harmonics": sum(len(term.weights) for term in self._orders),
+            "range": self.value_range,
+            "value far away": self._range.pole,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _HypersphericalEvaluator(Evaluator):
+    """The evaluator of a `HypersphericalHarmonic` f, which has the proofs.
+
+    degree: the degree l of the polynomial P.
+    orders: the parts of P that belong to one j each.
+    value_range: ranges of P on S^3.
+    """
+
+    degree: int
+    orders: tuple[_OrderTerm, ...]
+    value_range: HypersphereRange
+
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value, gradient and bounds of f near p. These are bounds of the Hessian
-        on several balls and a Lipschitz constant; the class has the proofs."""
+        on several balls and a Lipschitz constant; `HypersphericalHarmonic` has the proofs."""
         square = dr.squared_norm(p)
         value, gradient, error, gradient_error = self._values(p, 1 + square)
         promises = (*self._remainder_near_zero(p, square), *self._curvatures(square))
         # 2 l A, with A half the length of the range of P.
-        slope = self.degree * (self._range.high - self._range.low) * (1 + _ROUNDING)
+        slope = self.degree * (self.value_range.high - self.value_range.low) * (1 + _ROUNDING)
         lipschitz = Lipschitz(slope / self._min_square(square, _BIG), self._radius(square, _BIG))
         return Sample(
             value, gradient, promises, error, gradient_error, alternative_promises=(lipschitz,)
@@ -266,8 +314,8 @@ class HypersphericalHarmonic(Field):
         value, gradient_sum, radial_sum = zero, type(p)(0), zero
         error, gradient_error = zero, zero
         # The roundings of a term: a few for its products, and one for each sum over the parts.
-        operations = len(self._orders) + 8.0
-        for term in self._orders:
+        operations = len(self.orders) + 8.0
+        for term in self.orders:
             # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, (x1, x2, x3) = evaluate(term.weights, y.x, y.y, y.z)
@@ -327,7 +375,7 @@ class HypersphericalHarmonic(Field):
         square: |p|^2.
         """
         l = self.degree  # noqa: E741
-        max_gradient = l * self._range.largest * (1 + _ROUNDING)
+        max_gradient = l * self.value_range.largest * (1 + _ROUNDING)
         promises: list[TaylorRemainder] = []
         for fraction in _BALL_RADII:
             # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed
@@ -353,8 +401,8 @@ class HypersphericalHarmonic(Field):
         # By the chain rule: with Q = 1 + |q|^2, the image on S^3 of a line moves at the speed 2/Q
         # and has a second derivative of the length 4/Q^1.5. Derivatives of S(y) C(w) are bounded at
         # all points of S^3 within a chord.
-        axis_order = min(abs(m) for term in self._orders for _, m in term.weights)
-        center_order = min(term.j for term in self._orders)
+        axis_order = min(abs(m) for term in self.orders for _, m in term.weights)
+        center_order = min(term.j for term in self.orders)
         if center_order < 3:
             return ()
         y = (2 / (1 + square)) * p
@@ -366,7 +414,7 @@ class HypersphericalHarmonic(Field):
         min_square = self._min_square(square, _MAX_RADIUS)
         inverse_root = dr.rcp(dr.sqrt(min_square))
         second_max = 0 * square
-        for term in self._orders:
+        for term in self.orders:
             first, second = term.largest(rho + chord, r + chord)
             second_max = second_max + 4 * inverse_root * inverse_root * inverse_root * dr.fma(
                 inverse_root, second, first
@@ -400,7 +448,7 @@ class HypersphericalHarmonic(Field):
         square = 1 + dr.squared_norm(closest)
         position = dr.dot(p, path.direction)
         l, sqrt_square = self.degree, dr.sqrt(square)  # noqa: E741
-        bounds = self._range
+        bounds = self.value_range
         # Two bounds of |f_aa|, the second derivative by the angle on the circle. By the chain rule,
         # as the circle has the radius 1/c with c^2 = `square`; and by Bernstein's inequality, as f
         # is a trigonometric polynomial of degree l of the angle.
@@ -444,7 +492,7 @@ class HypersphericalHarmonic(Field):
         y, w, zero = 2 * s * p, 1 - 2 * s, 0 * p.x
         rows = [[zero] * 4 for _ in range(4)]
         slopes = [zero] * 4
-        for term in self._orders:
+        for term in self.orders:
             # C(w), C'(w) and C''(w)
             c, first, second = term.axial(w)
             harmonic, gradient = evaluate(term.weights, y.x, y.y, y.z)
@@ -480,31 +528,3 @@ class HypersphericalHarmonic(Field):
                 row.append(total + 4 * s * s * curved)
             result.append(vector(*row))
         return result[0], result[1], result[2]
-
-    def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """The domain or, if there is none, a ball about the origin that contains the level sets;
-        None if they may be unbounded.
-
-        levels: the levels of f.
-        """
-        if self.domain is not None:
-            return self.domain
-        radius = max((self._range.radius(level) for level in levels), default=0.0)
-        return Ball(radius=radius) if 0 < radius < math.inf else None
-
-    def validate_levels(self, levels: tuple[float, ...]) -> None:
-        """Raise ValueError for a level outside of the proved range of f, and for a constant f."""
-        if self.degree == 0:
-            raise ValueError(
-                "a hyperspherical harmonic of degree 0 is constant: it has no level sets"
-            )
-        validate_levels_in_range(levels, self.value_range)
-
-    def describe(self) -> dict[str, Any]:
-        """The degree, the number of terms and the proved range of f, as a dictionary for users."""
-        return {
-            "degree": self.degree,
-            "harmonics": sum(len(term.weights) for term in self._orders),
-            "range": self.value_range,
-            "value far away": self._range.pole,
-        }

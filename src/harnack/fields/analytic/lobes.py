@@ -7,9 +7,9 @@ negative."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import drjit as dr
@@ -22,11 +22,13 @@ from harnack.enclosures.samples import RaySample, space_scaled
 from harnack.fields.analytic.rounding import HarmonicRounding
 from harnack.fields.analytic.solid_harmonics import (
     LARGEST_DEGREE,
+    Weights,
     degree_and_order,
     evaluate,
     hessian,
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample
 from harnack.fields.parameters import record_call
 from harnack.geometry.clip_volumes import Ball
@@ -130,9 +132,8 @@ class Lobes(Field):
         scale = as_positive(scale, "the scale of lobes")
         if not is_one_of(sign, _SIGNS):
             raise ValueError(f"part must be one of {', '.join(_SIGNS)}, not {sign!r}")
-        self.scale, self.part = scale, sign
-        # `prepare` puts a number of the backend in its place.
-        self._size: Any = self.scale
+        self.scale = scale
+        self.part: LobeSign = sign
         (first_harmonic, *other_harmonics) = self.weights
         if other_harmonics:
             # The range of the sum of solid harmonics on the unit ball, which contains the sphere.
@@ -174,13 +175,14 @@ class Lobes(Field):
         ends = {"both": max(-low, high), "positive": high, "negative": -low}
         return self.scale * ends[self.part]
 
-    def prepare(self, backend: Backend) -> Field:
-        """A copy of the field whose scale lies on the backend as data, not as a literal: Dr.Jit
-        then need not compile its code again for another scale.
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f for any plan. The scale lies on the backend as data, not as a literal:
+        Dr.Jit then need not compile its code again for another scale.
 
         Raises:
             ValueError: the scale or the largest |Y| is too small or too large for the precision.
         """
+        del plan
         limit, largest = _LARGEST_SIZE[backend.precision], max(map(abs, self.value_range))
         if not (1 / limit <= self.scale <= limit and 1 / limit <= largest <= limit):
             raise ValueError(
@@ -188,9 +190,8 @@ class Lobes(Field):
                 f"{1 / limit:.0e} to {limit:.0e}, not {self.scale:.3g} and {largest:.3g}: choose "
                 "another unit of length"
             )
-        field = copy.copy(self)
-        field._size = dr.opaque(backend.Float, self.scale)
-        return field
+        scale = dr.opaque(backend.Float, self.scale)
+        return _LobesEvaluator(self.weights, self.part, scale, self.value_range, self._rounding)
 
     def extent(self, levels: tuple[float, ...]) -> Volume:
         """A ball about the origin that contains the level sets.
@@ -205,10 +206,38 @@ class Lobes(Field):
         beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
 
+    def describe(self) -> dict[str, Any]:
+        """The degree, the chosen sign and the length of the longest lobe, as a dictionary for
+        users."""
+        return {"degree": self.degree, "lobes": self.part, "longest": self.extent_radius()}
+
+
+@dataclass(frozen=True, eq=False)
+class _LobesEvaluator(Evaluator):
+    """The evaluator of the field f of lobes (`Lobes`), on a backend.
+
+    weights: a mapping {(l, m): c}, for the sum Y of c Y_lm.
+    part: for which signs of Y lobes are drawn.
+    scale: the length of a lobe in which Y reaches 1, a number of the backend.
+    value_range: an interval that contains all values of Y on the unit sphere.
+    rounding: bounds of the rounding of Y and of its gradient.
+    """
+
+    weights: Weights
+    part: LobeSign
+    scale: Real
+    value_range: tuple[float, float]
+    rounding: HarmonicRounding
+
+    @property
+    def degree(self) -> int:
+        """The degree of Y: the largest degree of a spherical harmonic in it."""
+        return max(l for l, _ in self.weights)  # noqa: E741
+
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value, gradient and bounds of second derivatives of f on balls about p.
         It is that of lobes of scale 1 at p/scale, scaled back."""
-        return space_scaled(self._unscaled(p / self._size), self._size)
+        return space_scaled(self._unscaled(p / self.scale), self.scale)
 
     def _unscaled(self, x: Vec3) -> Sample:
         """The sample at points x for lobes of scale 1: value, gradient, bounds of their errors, and
@@ -298,11 +327,11 @@ class Lobes(Field):
             sign: 1 for the length in front of the point, -1 for the length behind it.
             slope_range: the range of the derivative of f in that direction.
             """
-            length = dr.select(dr.isfinite(length), length, 4 * (safe_norm(p) + self._size))
+            length = dr.select(dr.isfinite(length), length, 4 * (safe_norm(p) + self.scale))
             end = dr.fma(type(p)(sign * length), path.direction, p)
             # The distance from the origin is largest at an end of the length.
-            farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self._size)
-            inverse_square = 1 / dr.square(self._size)
+            farthest = fmax(safe_norm(p), safe_norm(end)) * ((1 + _ROUNDING) / self.scale)
+            inverse_square = 1 / dr.square(self.scale)
             lower, upper = self._second_derivatives(farthest)
             return ParabolaEnclosure(
                 slope_range, inverse_square * lower, inverse_square * upper, length
@@ -360,9 +389,9 @@ class Lobes(Field):
         roundoff = float(dr.epsilon(type(r)))
         max_value, degree = max(map(abs, self.value_range)), self.degree
         # The direction is at the distance 1 from the origin.
-        y_error = roundoff * (self._rounding.value_error(rho, 1.0) + (8 * degree + 4) * max_value)
+        y_error = roundoff * (self.rounding.value_error(rho, 1.0) + (8 * degree + 4) * max_value)
         slope_error = roundoff * (
-            2 * self._rounding.gradient_error(rho, 1.0)
+            2 * self.rounding.gradient_error(rho, 1.0)
             + (8 * degree**2 + 16 * degree + 16) * max_value
         )
         if self.part == "both":
@@ -388,10 +417,10 @@ class Lobes(Field):
         distance = safe_norm(p)
         at_origin = distance == 0
         u = dr.select(at_origin, type(p)(0, 0, 1), p / dr.select(at_origin, 1, distance))
-        r = distance / self._size
+        r = distance / self.scale
         sign, inverse_square = (
             -1.0 if self.part == "negative" else 1.0,
-            1 / dr.square(self._size),
+            1 / dr.square(self.scale),
         )
         rows: list[Any] = []
         if self.part == "both":
@@ -437,11 +466,6 @@ class Lobes(Field):
                 new_row[i] += k * harmonic
                 rows[i] = rows[i] + new_row
         return value, gradient, (rows[0], rows[1], rows[2])
-
-    def describe(self) -> dict[str, Any]:
-        """The degree, the chosen sign and the length of the longest lobe, as a dictionary for
-        users."""
-        return {"degree": self.degree, "lobes": self.part, "longest": self.extent_radius()}
 
 
 def _checked(weights: Any) -> dict[tuple[int, int], float]:

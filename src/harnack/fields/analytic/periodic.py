@@ -38,11 +38,12 @@ from harnack.fields.analytic.waves import (
     mean_wavelength,
     sine_factor,
 )
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.geometry.volume import Volume
 
 __all__ = [
@@ -282,51 +283,12 @@ class EigenfunctionSum(Field):
         """A proved bound of the absolute second derivatives of f along any direction."""
         return self.waves.largest_curvature
 
-    def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: value, gradient and bounds of f near p. These are a bound of second
-        derivatives that holds everywhere, a local Lipschitz constant, and a range on a ball of four
-        dimensions in which the harmonic extension of f is harmonic. The class has the proofs."""
-        value, components = evaluate_terms(self.terms, p)
-        gradient = type(p)(*components)
-        epsilon = float(dr.epsilon(type(value)))
-        error, gradient_error = self._rounding.errors(p, gradient)
-        gradient_norm_bound = dr.norm(gradient) + gradient_error
-        radius = 0.9 * self.max_gradient / self.curvature  # the best by experiment, gyroid and P
-        local_constant = (gradient_norm_bound + 0.5 * self.curvature * radius) * (1 + _ROUNDING)
-        lipschitz = Lipschitz(fmin(local_constant, self.max_gradient * (1 + _ROUNDING)), radius)
-        third_derivative_bound = self.waves.max_third_derivative * (1 + _ROUNDING)
-        promises = (
-            TaylorRemainder(
-                self.curvature * (1 + _ROUNDING + _SLOPE_SHARE),
-                cubic_constant=third_derivative_bound,
-            ),
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        del backend, plan
+        return _WaveSumEvaluator(
+            self.terms, self.waves, self._extension, self._rounding, self._rounding_bound
         )
-        alternatives = (self._extension.ball(value, gradient_norm_bound), lipschitz)
-        # The effects of the gradient's rounding error E: E^2/(2 h H) for Taylor's formula, with the
-        # bound H of second derivatives and h = `_SLOPE_SHARE`; and for the harmonic ball of radius
-        # R the part of E R that the proofs on balls do not allow for themselves.
-        error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * self.curvature)))
-        error += fmax(gradient_error * self._extension.radius - self._rounding_bound * epsilon, 0)
-        return Sample(value, gradient, promises, error, alternative_promises=alternatives)
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f at p. Its trace is not zero, because f itself is not
-        harmonic."""
-        x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
-        return x, y, z
-
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two bounds, of the rounding errors of the gradient and of the Hessian of f at p.
-
-        sample: not used.
-        """
-        del sample
-        return self._rounding.derivative_errors(p)
-
-    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A bound of |grad f(y) - grad f(p)| for |y - p| <= radius: the radius times `curvature`,
-        which bounds the norm of the Hessian everywhere."""
-        return 0 * p.x + radius * (self.curvature * (1 + _ROUNDING))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level outside of the proved range of f."""
@@ -377,6 +339,73 @@ class EigenfunctionSum(Field):
             "max_gradient": self.max_gradient,
             "radius of the harmonic ball": self._extension.radius,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class _WaveSumEvaluator(Evaluator):
+    """The evaluator of an `EigenfunctionSum` f, which has the proofs.
+
+    terms: the products of waves and plane waves whose sum is f.
+    bounds: proved bounds of f and of its derivatives.
+    extension: bounds of the harmonic extension of f on balls of R^4.
+    rounding: bounds of the rounding of value and derivatives.
+    rounding_bound: the part of the error E R for which the proofs on balls allow themselves, in
+        units of the unit roundoff.
+    """
+
+    terms: tuple[Term, ...]
+    bounds: WaveBounds
+    extension: ExtensionBounds
+    rounding: WaveRounding
+    rounding_bound: float
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value, gradient and bounds of f near p. These are a bound of second
+        derivatives that holds everywhere, a local Lipschitz constant, and a range on a ball of four
+        dimensions in which the harmonic extension of f is harmonic. `EigenfunctionSum` has the
+        proofs."""
+        value, components = evaluate_terms(self.terms, p)
+        gradient = type(p)(*components)
+        epsilon = float(dr.epsilon(type(value)))
+        error, gradient_error = self.rounding.errors(p, gradient)
+        gradient_norm_bound = dr.norm(gradient) + gradient_error
+        max_gradient, curvature = self.bounds.largest_gradient, self.bounds.largest_curvature
+        radius = 0.9 * max_gradient / curvature  # the best by experiment, gyroid and P
+        local_constant = (gradient_norm_bound + 0.5 * curvature * radius) * (1 + _ROUNDING)
+        lipschitz = Lipschitz(fmin(local_constant, max_gradient * (1 + _ROUNDING)), radius)
+        third_derivative_bound = self.bounds.max_third_derivative * (1 + _ROUNDING)
+        promises = (
+            TaylorRemainder(
+                curvature * (1 + _ROUNDING + _SLOPE_SHARE),
+                cubic_constant=third_derivative_bound,
+            ),
+        )
+        alternatives = (self.extension.ball(value, gradient_norm_bound), lipschitz)
+        # The effects of the gradient's rounding error E: E^2/(2 h H) for Taylor's formula, with the
+        # bound H of second derivatives and h = `_SLOPE_SHARE`; and for the harmonic ball of radius
+        # R the part of E R that the proofs on balls do not allow for themselves.
+        error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * curvature)))
+        error += fmax(gradient_error * self.extension.radius - self.rounding_bound * epsilon, 0)
+        return Sample(value, gradient, promises, error, alternative_promises=alternatives)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the Hessian of f at p. Its trace is not zero, because f itself is not
+        harmonic."""
+        x, y, z = (type(p)(*row) for row in hessian_of_terms(self.terms, p))
+        return x, y, z
+
+    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
+        """Two bounds, of the rounding errors of the gradient and of the Hessian of f at p.
+
+        sample: not used.
+        """
+        del sample
+        return self.rounding.derivative_errors(p)
+
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
+        """A bound of |grad f(y) - grad f(p)| for |y - p| <= radius: the radius times the
+        `largest_curvature` of the bounds, which bounds the norm of the Hessian everywhere."""
+        return 0 * p.x + radius * (self.bounds.largest_curvature * (1 + _ROUNDING))
 
 
 def _wavenumber(cell: Any) -> float:

@@ -12,7 +12,6 @@ where a branch is not analytic.
 
 from __future__ import annotations
 
-import copy
 import math
 import numbers
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -41,6 +40,7 @@ from harnack.fields.analytic.branches import (
     complex_type,
     derivatives,
 )
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
 from harnack.geometry.clip_volumes import Box, VolumeIntersection
@@ -48,7 +48,7 @@ from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
-    from harnack.fields.analytic.branches import Branch, Complex
+    from harnack.fields.analytic.branches import Branch, BranchEvaluator, Complex
     from harnack.geometry import Volume
 
 __all__ = ["make_branches", "power_product"]
@@ -273,7 +273,7 @@ def _user_branches(
     shift = None if period is None else float(period)
     branches_of_user = UserBranches(function, points, second_bound, len(branches), shift)
     # Raises the errors that the recorded evaluation would raise.
-    branches_of_user.evaluate(z)
+    branches_of_user.on_backend(backend).evaluate(z)
     return branches_of_user
 
 
@@ -322,9 +322,9 @@ class LevelCurves(Field):
 
     Promises (proved bounds of f near a point). f is harmonic in the plane, so Harnack's inequality
     of dimension 2 holds in disks that contain no singular point. There |g"| is bounded
-    (`Branches.second_derivative_bound`), so f changes by at most |g'| r + max|g"| r^2/2 on a disk
-    of radius r. Each disk gives two promises: this range, as a `HarmonicBall` of dimension 2, and
-    the bound of second derivatives.
+    (`BranchEvaluator.second_derivative_bound`), so f changes by at most |g'| r + max|g"| r^2/2 on a
+    disk of radius r. Each disk gives two promises: this range, as a `HarmonicBall` of dimension 2,
+    and the bound of second derivatives.
 
     Raises:
         TypeError, ValueError: an invalid function, or a function with several branches.
@@ -372,17 +372,28 @@ class LevelCurves(Field):
         """The arguments of the constructor by name, those of the function as they were given."""
         return {**super().constructor_arguments(), **self._branch_arguments}
 
-    def prepare(self, backend: Backend) -> LevelCurves:
-        """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need
-        not compile its code again for other numbers."""
-        field = copy.copy(self)
-        field.branches = self.branches.prepare(backend)
-        return field
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f for any plan. Its numbers lie on the backend as data, not as literals:
+        Dr.Jit then need not compile its code again for other numbers."""
+        del plan
+        return _LevelCurvesEvaluator(self.branches.on_backend(backend), self.part)
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelCurvesEvaluator(Evaluator):
+    """The evaluator of the function f of `LevelCurves`, which has the proofs, on a backend.
+
+    branches: the analytic function g.
+    part: the part of g that f is, "real" or "imag".
+    """
+
+    branches: BranchEvaluator
+    part: str
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value, gradient and bounds of f on two disks about p that contain no
         singular point. Each disk gives a range of f in a ball in which f is harmonic, and a bound
-        of second derivatives; the class has their proof."""
+        of second derivatives; `LevelCurves` has their proof."""
         rounding, z, branch = self._at(p)
         slope_x, slope_y = derivatives(branch.first, self.part)
         vector = cast("Any", type(p))
@@ -481,10 +492,6 @@ class HeightField(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return z - self.function(x, y)
-
-    def prepare(self, backend: Backend) -> Formula:
-        del backend
-        return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The part of the domain between the lowest and the highest height that the level sets can

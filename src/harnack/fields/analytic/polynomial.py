@@ -42,11 +42,12 @@ from harnack.fields.analytic.sphere_bounds import (
     range_of_harmonic,
     value_bound,
 )
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Backend, Real, Vec3
     from harnack.geometry.volume import Volume
 
 __all__ = ["HarmonicPolynomial", "SphericalHarmonic"]
@@ -310,45 +311,10 @@ class _SolidHarmonics(Field):
         """The largest degree of a solid harmonic in the sum."""
         return max(degree for degree, _ in self._weights)
 
-    def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: value, gradient and bounds of f near p. They are computed at the point
-        p/size, where `HarmonicPromises` has the bounds, and scaled back to p."""
-        local_p, size = self._local(p), self._size
-        value, gradient = evaluate(self._weights, local_p.x, local_p.y, local_p.z)
-        # The distances of the scaled point from the z axis and from the origin.
-        rho, r = dr.norm(type(local_p)(local_p.x, local_p.y, 0)), dr.norm(local_p)
-        ball, lipschitz = self._promises.ball(rho, r), self._promises.lipschitz(rho, r)
-        curvatures = self._promises.curvatures(rho, r)
-        promises = tuple(
-            TaylorRemainder(promise.constant / size**2, promise.radius * size)
-            for promise in curvatures
-        )
-        alternatives: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
-        if lipschitz is not None:
-            alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
-        error = self._promises.error(rho, r, curvatures[0])
-        # The gradient with its components in the order of the coordinates of p, which `_local`
-        # rotates by axis + 1 positions.
-        gradient_at_p = type(p)(*_rotate_axes(gradient, -self._axis - 1)) / size
-        return Sample(
-            value, gradient_at_p, promises, error, alternative_promises=tuple(alternatives)
-        )
-
-    def _local(self, p: Vec3) -> Vec3:
-        """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided
-        by the size."""
-        return type(p)(*_rotate_axes((p.x, p.y, p.z), self._axis + 1)) / self._size
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f at p; its trace is 0 up to rounding."""
-        local_p, scale, turns = self._local(p), 1 / self._size**2, -self._axis - 1
-        xx, yy, zz, xy, xz, yz = (
-            scale * entry for entry in hessian(self._weights, local_p.x, local_p.y, local_p.z)
-        )
-        rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        # Rows and columns in the order of the coordinates of p.
-        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, turns)) for row in rows], turns)
-        return x, y, z
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        del backend, plan
+        return _SolidHarmonicsEvaluator(self._weights, self._axis, self._size, self._promises)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level outside of the proved range of f in its domain."""
@@ -361,6 +327,62 @@ class _SolidHarmonics(Field):
             "solid harmonics": len(self._weights),
             "range in the domain": self.value_range,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class _SolidHarmonicsEvaluator(Evaluator):
+    """The evaluator of a sum of solid harmonics of the point p/size.
+
+    weights: a mapping (l, m) -> coefficient of the solid harmonic of degree l and order m.
+    axis: the index of the coordinate of p that is the z of the solid harmonics.
+    size: the size.
+    promises: the proved bounds of the sum near a point p/size.
+    """
+
+    weights: Weights
+    axis: int
+    size: float
+    promises: HarmonicPromises
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: value, gradient and bounds of f near p. They are computed at the point
+        p/size, where `HarmonicPromises` has the bounds, and scaled back to p."""
+        local_p, size = self._local(p), self.size
+        value, gradient = evaluate(self.weights, local_p.x, local_p.y, local_p.z)
+        # The distances of the scaled point from the z axis and from the origin.
+        rho, r = dr.norm(type(local_p)(local_p.x, local_p.y, 0)), dr.norm(local_p)
+        ball, lipschitz = self.promises.ball(rho, r), self.promises.lipschitz(rho, r)
+        curvatures = self.promises.curvatures(rho, r)
+        promises = tuple(
+            TaylorRemainder(promise.constant / size**2, promise.radius * size)
+            for promise in curvatures
+        )
+        alternatives: list[Promise] = [HarmonicBall(ball.radius * size, ball.lower, ball.upper)]
+        if lipschitz is not None:
+            alternatives.append(Lipschitz(lipschitz.constant / size, lipschitz.radius * size))
+        error = self.promises.error(rho, r, curvatures[0])
+        # The gradient with its components in the order of the coordinates of p, which `_local`
+        # rotates by axis + 1 positions.
+        gradient_at_p = type(p)(*_rotate_axes(gradient, -self.axis - 1)) / size
+        return Sample(
+            value, gradient_at_p, promises, error, alternative_promises=tuple(alternatives)
+        )
+
+    def _local(self, p: Vec3) -> Vec3:
+        """The point p in the coordinates of the solid harmonics: with its axes rotated, and divided
+        by the size."""
+        return type(p)(*_rotate_axes((p.x, p.y, p.z), self.axis + 1)) / self.size
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the Hessian of f at p; its trace is 0 up to rounding."""
+        local_p, scale, turns = self._local(p), 1 / self.size**2, -self.axis - 1
+        xx, yy, zz, xy, xz, yz = (
+            scale * entry for entry in hessian(self.weights, local_p.x, local_p.y, local_p.z)
+        )
+        rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+        # Rows and columns in the order of the coordinates of p.
+        x, y, z = _rotate_axes([type(p)(*_rotate_axes(row, turns)) for row in rows], turns)
+        return x, y, z
 
 
 class SphericalHarmonic(_SolidHarmonics):

@@ -9,7 +9,6 @@ each branch stands for all its shifts by whole periods."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -28,12 +27,13 @@ from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_of, derivatives
 from harnack.fields.analytic.plane import copied_arguments, make_branches
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field
 from harnack.geometry.clip_volumes import Ball, Box, VolumeIntersection
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
-    from harnack.fields.analytic.branches import Branch, Complex, PreparedBranchPoint
+    from harnack.fields.analytic.branches import Branch, BranchEvaluator, Complex, DeviceBranchPoint
     from harnack.geometry import Volume
 
 # Second derivatives along the ray are bounded on the whole requested length, and on lengths that
@@ -144,11 +144,11 @@ class RiemannSurface(Field):
     `NearestBranchEnclosure` computes the length of the ray within which the surface of this branch
     cannot be met, and takes the minimum over all branches. It uses the slopes of the branches at
     the sample, and a bound of |g''| on the segment of the plane below the ray, which holds for all
-    branches (`Branches.second_derivative_bound`): since h is linear along the ray, |d^2 phi_j/ds^2|
-    <= |g''| |w|^2, where w is the projection of the ray's direction to the plane. The nearest
-    branch may change between two samples, because the proof covers all branches. Near branch points
-    with a power > 0 all branches are near one value; `BranchPointEnclosure` proves the step of a
-    ray that passes such a point at another height.
+    branches (`BranchEvaluator.second_derivative_bound`): since h is linear along the ray,
+    |d^2 phi_j/ds^2| <= |g''| |w|^2, where w is the projection of the ray's direction to the plane.
+    The nearest branch may change between two samples, because the proof covers all branches. Near
+    branch points with a power > 0 all branches are near one value; `BranchPointEnclosure` proves
+    the step of a ray that passes such a point at another height.
 
     A point is a hit if |f| is at most the tolerance times |grad f| and, near such a branch point,
     the surface is not proved to be farther away than the tolerance: there the slope grows without
@@ -194,10 +194,9 @@ class RiemannSurface(Field):
         # The radius of the default domain.
         radius = {"log": 4.0, "asin": 2.0}.get(function, 1.0) if isinstance(function, str) else 1.0
         self.domain = Ball(radius=radius) if domain is None else domain
-        self._height: Any = self.height
         # The period is scaled like the heights. Only with one branch is f itself periodic.
         shift = self.branches.period(part == "imag")
-        self._shift: Any = None if shift is None else abs(self.height) * shift
+        self._shift = None if shift is None else abs(self.height) * shift
         self._is_single = self.branches.count == 1
         self.has_creases = not self._is_single
         if self._is_single:
@@ -207,15 +206,16 @@ class RiemannSurface(Field):
         """The arguments of the constructor by name, those of the function as they were given."""
         return {**super().constructor_arguments(), **self._branch_arguments}
 
-    def prepare(self, backend: Backend) -> RiemannSurface:
-        """The same field with its numbers on the backend as data, not as literals: Dr.Jit then need
-        not compile its code again for other numbers."""
-        field = copy.copy(self)
-        field.branches = self.branches.prepare(backend)
-        field._height = dr.opaque(backend.Float, self.height)
-        if self._shift is not None and not self._is_single:
-            field._shift = dr.opaque(backend.Float, self._shift)
-        return field
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of f for any plan. Its numbers lie on the backend as data, not as literals:
+        Dr.Jit then need not compile its code again for other numbers."""
+        del plan
+        branches = self.branches.on_backend(backend)
+        height, shift = dr.opaque(backend.Float, self.height), self._shift
+        # With a single branch the shift is the field's period, and f is computed without it.
+        if shift is not None and not self._is_single:
+            shift = dr.opaque(backend.Float, shift)
+        return _RiemannSurfaceEvaluator(branches, self.part, height, shift, self._is_single)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The part of the domain between the lowest and the highest height that the level sets can
@@ -250,6 +250,37 @@ class RiemannSurface(Field):
         middle = 0.5 * (corners[0] + corners[3])
         reach = max(abs(corner - middle) for corner in corners)
         return abs(self.height) * self.branches.max_abs(middle, reach)
+
+    def describe(self) -> dict[str, Any]:
+        """The number of branches, the period and the singular points, as a dictionary for users."""
+        return {
+            "branches": self.branches.count,
+            "period": self._shift,
+            "singular points": [point.location for point in self.branches.branch_points],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _RiemannSurfaceEvaluator(Evaluator):
+    """The evaluator of the field f of a `RiemannSurface`, which has the proofs, on a backend.
+
+    branches: the analytic function g with all its branches.
+    part: the part of g that is the height, "imag" or "real".
+    height: the factor of the height, a number of the backend.
+    shift: the period of the heights; None if they do not repeat.
+    is_single: whether there is a single branch.
+    """
+
+    branches: BranchEvaluator
+    part: str
+    height: Real
+    shift: Real | None
+    is_single: bool
+
+    @property
+    def _height_factor(self) -> Real:
+        """The absolute value of the factor `height`, by which the branches are multiplied."""
+        return dr.abs(self.height)
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p, with three proved bounds of f near p, which use disks of the plane
@@ -333,7 +364,7 @@ class RiemannSurface(Field):
         # its proof may reach farther.
         lengths = [longest, *(fmin(longest, share * clearance / speed) for share in _FRACTIONS)]
         forwards = [self._enclosure(at_point, d, projection, length) for length in lengths]
-        if not self._is_single:
+        if not self.is_single:
             forwards += self._cusp_enclosures(at_point, d, projection)
         # Slightly longer than the requested length, as steps are rounded down.
         back = fmin(back, _MAX_LENGTH) * (1 + 1e-5)
@@ -367,25 +398,12 @@ class RiemannSurface(Field):
                 dr.select(is_nearest, branch_xy, u_xy),
             )
         # f is the sign times (h - height u), so u counts with a minus.
-        scale = -at_p.sign * self._height
+        scale = -at_p.sign * self.height
         u_xx, u_xy, zero = scale * u_xx, scale * u_xy, 0 * p.x
         vector = cast("Any", type(p))
         return vector(u_xx, u_xy, zero), vector(u_xy, -u_xx, zero), vector(zero, zero, zero)
 
-    def describe(self) -> dict[str, Any]:
-        """The number of branches, the period and the singular points, as a dictionary for users."""
-        return {
-            "branches": self.branches.count,
-            "period": self._shift,
-            "singular points": [point.location for point in self.branches.branch_points],
-        }
-
     # At points.
-
-    @property
-    def _height_factor(self) -> Real:
-        """The absolute value of the factor `height`, by which the branches are multiplied."""
-        return dr.abs(self._height)
 
     def _rounding(self, p: Vec3) -> Real:
         """A generous bound of the rounding error of the projection of p to the plane, as a distance
@@ -412,22 +430,20 @@ class RiemannSurface(Field):
             u = branch.value.imag if self.part == "imag" else branch.value.real
             slope_x, slope_y = derivatives(branch.first, self.part)
             phi, slope_x, slope_y = (
-                p.z - self._height * u,
-                -self._height * slope_x,
-                -self._height * slope_y,
+                p.z - self.height * u,
+                -self.height * slope_x,
+                -self.height * slope_y,
             )
             real = cast("Any", type(phi))
             sign_factor = dr.select(phi < 0, real(-1), 1)
-            if self._shift is not None and not self._is_single:
-                periods = dr.floor(phi / self._shift)
+            if self.shift is not None and not self.is_single:
+                periods = dr.floor(phi / self.shift)
                 # The sign of sin(pi phi/period) is 1 if the number of whole periods is even.
                 sign_factor = dr.select(periods == 2 * dr.floor(0.5 * periods), real(1), -1)
-                phi = phi - self._shift * dr.round(phi / self._shift)
+                phi = phi - self.shift * dr.round(phi / self.shift)
                 next_graphs.append(
                     # The graph on the other side of p: one period away, against the sign of phi.
-                    _BranchValue(
-                        phi - dr.mulsign(real(self._shift), phi), slope_x, slope_y, real(1)
-                    )
+                    _BranchValue(phi - dr.mulsign(real(self.shift), phi), slope_x, slope_y, real(1))
                 )
             nearest_graphs.append(_BranchValue(phi, slope_x, slope_y, sign_factor))
         return nearest_graphs + next_graphs
@@ -442,7 +458,7 @@ class RiemannSurface(Field):
             p.z
         )
         error = backend_of(p).machine_epsilon * error_units
-        for point in self.branches.points_on(z):  # slopes do not bound the rounding of values there
+        for point in self.branches.points:  # slopes do not bound the rounding of values there
             if point.power is not None:
                 is_close = abs(z - point.at) <= 2 * rounding
                 jump = (
@@ -465,7 +481,7 @@ class RiemannSurface(Field):
         error, rounding: bounds of the errors of phi and of z, which are only stored in the result.
         """
         nearest, sign = graphs[0], type(graphs[0].phi)(1)
-        if not self._is_single:
+        if not self.is_single:
             for graph in graphs[1:]:
                 is_closer = dr.abs(graph.phi) < dr.abs(nearest.phi)
                 nearest = _BranchValue(
@@ -506,7 +522,7 @@ class RiemannSurface(Field):
 
     def _bounded_branch_points(
         self, local: _PointBranches
-    ) -> list[tuple[PreparedBranchPoint, Complex, Real]]:
+    ) -> list[tuple[DeviceBranchPoint, Complex, Real]]:
         """The branch points near which all branches are near one value: those with a bound |g -
         value| <= constant |z - location|^power. An empty list if the function has only one branch.
 
@@ -516,16 +532,16 @@ class RiemannSurface(Field):
         location; and the height of p above the height that belongs to `value`. (If heights repeat
         with a period, it is the height above the nearest of all shifts of that one.)
         """
-        points: list[tuple[PreparedBranchPoint, Complex, Real]] = []
-        if self._is_single:
+        points: list[tuple[DeviceBranchPoint, Complex, Real]] = []
+        if self.is_single:
             return points
-        for point in self.branches.points_on(local.z):
+        for point in self.branches.points:
             if point.power is None:
                 continue
             value = point.value.imag if self.part == "imag" else point.value.real
-            height = local.h - self._height * value
-            if self._shift is not None:
-                height -= self._shift * dr.round(height / self._shift)
+            height = local.h - self.height * value
+            if self.shift is not None:
+                height -= self.shift * dr.round(height / self.shift)
             points.append((point, local.z - point.at, height))
         return points
 
@@ -556,7 +572,7 @@ class RiemannSurface(Field):
             # How fast the ray's height approaches the common value. With a period there is one
             # above and one below.
             approach_rate = dr.abs(d.z)
-            if self._shift is None:
+            if self.shift is None:
                 approach_rate = fmax(-dr.mulsign(d.z, height), 0)
             gap = fmax(dr.abs(height) - local.error, 0)
             inner_radius = 0 * height + point.radius * (1 - 1e-6) - local.rounding
@@ -637,7 +653,7 @@ class RiemannSurface(Field):
             return SlopeRange.around(sign * slope, 16 * epsilon * size + slope_error * speed)
 
         # A single branch: f = phi has this slope, and second derivatives up to the bound.
-        if self._is_single:
+        if self.is_single:
             return ParabolaEnclosure(
                 slope_range(local.nearest, local.sign), -second_bound, second_bound, length
             )

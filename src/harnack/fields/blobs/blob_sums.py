@@ -34,7 +34,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
@@ -562,3 +562,18 @@ def jet_from_bounds(like: Jet, ends: Iterator[Any]) -> Jet:
     second = tuple(Interval(next(ends), next(ends)) for _ in like.second_derivatives)
     start = None if like.jet_at_start is None else jet_from_bounds(like.jet_at_start, ends)
     return Jet(value, first, second, start, like.piece_length)
+
+
+def backend_number(*jets: Jet) -> Any:
+    """Any Dr.Jit number among the ends of the intervals of jets. It tells the backend and the
+    number of lanes.
+
+    Raises:
+        TypeError: all ends are Python numbers.
+    """
+    for jet in jets:
+        for interval in (jet.value, *jet.first_derivatives):
+            for bound in (interval.lower, interval.upper):
+                if dr.is_array_v(cast("Any", type(bound))):
+                    return bound
+    raise TypeError("a sum needs a point of the backend: the coordinates are constants")

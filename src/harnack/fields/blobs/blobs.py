@@ -10,16 +10,14 @@ Waals radii.
 
 from __future__ import annotations
 
-import copy
 import functools
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Jet
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmin
@@ -33,13 +31,14 @@ from harnack.backend.validation import (
 )
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, SlopeRange
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.batched_fields import cached_upload
 from harnack.fields.blobs.blob_sums import (
     PIECES,
     PIECES_IN_CELL,
     ForEach,
     KnotRecorder,
     SumValue,
+    backend_number,
     blob_term,
     for_each_listed,
     for_each_record,
@@ -56,13 +55,15 @@ from harnack.fields.blobs.group_maximum import (
     group_maximum_jet,
 )
 from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
-from harnack.fields.formula import Formula, is_jet
+from harnack.fields.evaluator import POINTS, EvaluateOnly, Plan
+from harnack.fields.formula import Formula, FormulaEvaluator, is_jet
 from harnack.fields.parameters import record_arguments
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.formula import FormulaFunction
     from harnack.geometry import Volume
 
 # From this number of blobs on, a grid is faster than a sum over all blobs, by experiment.
@@ -117,8 +118,6 @@ class Blobs(Formula):
             centers, radii, weights, groups
         )
         self.kernel = choose_kernel(kernel)
-        # Set by `prepare`: the data on a backend.
-        self._on: _BlobDeviceData | None = None
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -136,15 +135,25 @@ class Blobs(Formula):
             CellLists.of(self.centers, self._supports) if len(self) >= _MIN_BLOBS_FOR_GRID else None
         )
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Blobs:
-        """The same field with its blobs uploaded to the backend. Code that Dr.Jit compiles for it
-        serves other blobs as well, because all numbers are data and none are literals."""
-        prepared = copy.copy(self)
-        prepared._on = _BlobDeviceData.upload(backend, self)
-        prepared.kernel = self.kernel.prepare(backend)
-        prepared.lipschitz = dr.opaque(backend.Float, self.largest_gradient())
-        return prepared
+    @cached_upload
+    def _upload(self, backend: Backend) -> _DeviceBlobs:
+        """The blobs on a backend. Code that Dr.Jit compiles for them serves other blobs as well,
+        because all numbers are data and none are literals."""
+        return _DeviceBlobs.upload(backend, self)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        blobs = self._upload(backend)
+        return _BlobsEvaluator(self, blobs, blobs.lipschitz, blobs)
+
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        return self._upload(backend)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates (intervals that contain values and derivatives), or at
+        Dr.Jit numbers. For jets the sum is over all blobs, because the grid serves only points."""
+        number = backend_number(x, y, z) if is_jet(x, type(self).__name__) else x
+        return self._upload(backend_of(number))(x, y, z)
 
     def largest_gradient(self) -> float:
         """A bound of |grad f| everywhere. It is a sum of bounds of the single blobs' gradients:
@@ -178,131 +187,6 @@ class Blobs(Formula):
                     "radius at level 1, and any other number but 0 gives a surface"
                 )
 
-    def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds
-        everywhere."""
-        data = self._prepared(p)
-        return self._sample(data.value_at(self.kernel, p))
-
-    def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
-        Lipschitz constant that holds everywhere.
-
-        sums: value and gradient of f at the points, with bounds of their errors.
-        """
-        promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
-        return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
-
-    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
-        point on which f takes none of the levels (the values that rays look for). It needs one loop
-        over the blobs nearby. There is no enclosure behind the point.
-
-        path: the ray.
-        t: a length along it.
-        ahead: the length in front of the point up to which proofs are wanted.
-        back: the same behind the point; not used.
-
-        In a grid, enclosures end where the ray leaves the cell of the point, enlarged by a margin:
-        up to there the cell's list of blobs is complete. If the cell is empty, f is 0 until the ray
-        comes to the first cell that is not empty. The enclosures then begin there and are proved
-        from that cell's list (`DelayedEnclosure`).
-        """
-        del back
-        p, d = path.point(t), path.direction
-        data = self._prepared(p)
-        piece_count = PIECES if data.grid is None else PIECES_IN_CELL
-        # The proofs are asked first at which knots they want ranges of derivatives; those are then
-        # computed in the one loop over the blobs.
-        recorder = KnotRecorder(piece_count)
-        no_slope = SlopeRange(0.0, 0.0)  # in place of the slope, which is not needed for this
-        path.proofs.from_restriction(recorder, no_slope, ahead)
-        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
-        if recorder.knots is None:
-            return path.enclose(self.evaluate(p))
-        data = self._prepared(p)
-        empty_length: Real | None = None
-        piece_start, length = p, fmin(ahead, data.max_path_length)
-        if data.grid is not None:
-            empty_length = skipped = data.grid.empty_run(p, d, ahead)
-            piece_start = dr.fma(type(p)(skipped), d, p)
-            # Behind an empty run the length counts from the first cell that is not empty, so
-            # `ahead` says nothing about it.
-            to_exit = data.grid.cell(piece_start).exit_distance(d)
-            length = fmin(
-                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), data.max_path_length
-            )
-        # The knots for the final length.
-        path.proofs.from_restriction(recorder, no_slope, length)
-        enclosures: tuple[Enclosure, ...]
-        if data.groups is None:
-            sums = sum_along(
-                self.kernel,
-                data.backend,
-                piece_start,
-                d,
-                recorder.knots,
-                data.near(piece_start),
-                signed=data.has_negative_weights,
-            )
-            start = (
-                # The sum is that at `piece_start`; at p, in an empty cell, f is 0.
-                sums.start if empty_length is None else _zero_where(empty_length > 0, sums.start)
-            )
-            slope = dr.dot(start.gradient, d)
-            slopes = SlopeRange.around(slope, start.gradient_error)
-            enclosures = path.proofs.from_restriction(sums, slopes, length)
-        else:
-            # The value at p, not at `piece_start`: over an empty length both are 0.
-            start = data.value_at(self.kernel, p)
-            slope = dr.dot(start.gradient, d)
-            enclosures = (
-                GroupMaximumEnclosure(
-                    self.kernel, data.grouped(piece_start), path, piece_start, start.value,
-                    recorder.knots, length, data.has_negative_weights,
-                ),
-            )  # fmt: skip
-        if empty_length is not None:
-            enclosures = tuple(
-                DelayedEnclosure(empty_length, enclosure) for enclosure in enclosures
-            )
-        # The next sample's proofs should reach as many of this step's lengths as there are pieces.
-        return RaySample(self._sample(start), enclosures, (), slope, float(piece_count))
-
-    def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at jets of the coordinates (intervals that contain values and derivatives), or at
-        Dr.Jit numbers. For jets the sum is over all blobs, because the grid serves only points."""
-        if not is_jet(x, type(self).__name__):
-            return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        data = self._prepared_for(backend_of(_backend_number(x, y, z)))
-        zero = data.backend.Float(0)
-        term = blob_term(self.kernel, (x, y, z))
-        if data.groups is None:
-            return sum_jets(term, x, zero, for_each_record(data.records))
-        # The list of all blobs.
-        return group_maximum_jet(term, x, zero, data.grouped(None))
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f at points p. If blobs have groups, it is the Hessian
-        of the largest of the groups' sums at p, which `Formula.hessian` computes with jets."""
-        data = self._prepared(p)
-        if data.groups is not None:
-            return super().hessian(p)
-        xx, xy, xz, yy, yz, zz = hessian_at(self.kernel, data.backend, p, data.near(p))
-        vector = data.backend.Array3f
-        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
-
-    def _prepared(self, p: Vec3) -> _BlobDeviceData:
-        """The uploaded data of the blobs, on the backend of the point p."""
-        return self._prepared_for(backend_of(p))
-
-    def _prepared_for(self, backend: Backend) -> _BlobDeviceData:
-        """The uploaded data of the blobs, on this backend. They are uploaded now unless `prepare`
-        has done so."""
-        if self._on is None:
-            return _BlobDeviceData.upload(backend, self)
-        return self._on
-
     def describe(self) -> dict[str, Any]:
         """The number of blobs, the kernel's name and the size of the grid, as a dictionary for
         users."""
@@ -314,27 +198,33 @@ class Blobs(Formula):
         return facts
 
 
-@dataclass(frozen=True)
-class _BlobDeviceData:
-    """The data of blobs, uploaded to a backend, and sums over them. A blob is a bump that is 0
-    outside of a ball, its support.
+@dataclass(frozen=True, eq=False)
+class _DeviceBlobs:
+    """Blobs on a backend, and sums over them. A blob is a bump that is 0 outside of a ball, its
+    support. Called with three coordinates, it is the formula of f.
 
+    name: the name of the field's class, for messages.
     records: the table of the blobs' numbers, one row for each blob (`_blob_records`).
     grid: the lists of the blobs near each cell of a grid; None for a small number of blobs.
     groups: the group of each blob, and the number of groups; None if all blobs are one sum.
     has_negative_weights: whether amplitudes (factors of blobs) may be negative.
     max_path_length: a length greater than that of any straight line through all supports.
+    kernel: the shape of the blobs.
+    lipschitz: a bound of |grad f| everywhere.
     """
 
     backend: Backend
+    name: str
     records: RecordTable
     grid: BlobGrid | None
     groups: tuple[Any, Any] | None
     has_negative_weights: bool
     max_path_length: Real
+    kernel: BlobKernel
+    lipschitz: Real
 
     @classmethod
-    def upload(cls, backend: Backend, blobs: Blobs) -> _BlobDeviceData:
+    def upload(cls, backend: Backend, blobs: Blobs) -> _DeviceBlobs:
         """Upload the data of `blobs` to a backend."""
         lists = blobs.cell_lists
         groups = None
@@ -344,13 +234,29 @@ class _BlobDeviceData:
         lower, upper = blobs.extent(()).bounds()
         return cls(
             backend,
+            type(blobs).__name__,
             RecordTable.upload(backend, _blob_records(backend, blobs)),
             None if lists is None else BlobGrid.upload(backend, lists),
             groups,
             bool((blobs.weights < 0).any()),
             # `max_path_length`: twice the diagonal of the blobs' box.
             dr.opaque(backend.Float, 2 * float(np.linalg.norm(upper - lower))),
+            blobs.kernel.on_backend(backend),
+            dr.opaque(backend.Float, blobs.largest_gradient()),
         )
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates (intervals that contain values and derivatives), or at
+        Dr.Jit numbers. For jets the sum is over all blobs, because the grid serves only points."""
+        if not is_jet(x, self.name):
+            points = EvaluateOnly(lambda p: self.sample(self.value_at(p)))
+            return points.differentiable_value(self.backend.Array3f(x, y, z))
+        zero = self.backend.Float(0)
+        term = blob_term(self.kernel, (x, y, z))
+        if self.groups is None:
+            return sum_jets(term, x, zero, for_each_record(self.records))
+        # The list of all blobs.
+        return group_maximum_jet(term, x, zero, self.grouped(None))
 
     def near(self, p: Vec3) -> ForEach:
         """Make a function that loops over the blobs whose supports may contain p: for_each(body,
@@ -375,12 +281,122 @@ class _BlobDeviceData:
         begin, end = self.grid.list_at(p)
         return GroupedList(self.records, group_of_blob, self.grid.entries, begin, end, count)
 
-    def value_at(self, kernel: BlobKernel, p: Vec3) -> SumValue:
+    def value_at(self, p: Vec3) -> SumValue:
         """f at points p: the sum of all blobs or, if there are groups, the largest of the groups'
-        sums. kernel: the shape of the blobs."""
+        sums."""
         if self.groups is None:
-            return value_at(kernel, self.backend, p, self.near(p))
-        return group_maximum_at(kernel, self.backend, p, self.grouped(p))
+            return value_at(self.kernel, self.backend, p, self.near(p))
+        return group_maximum_at(self.kernel, self.backend, p, self.grouped(p))
+
+    def sample(self, sums: SumValue) -> Sample:
+        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
+        Lipschitz constant that holds everywhere.
+
+        sums: value and gradient of f at the points, with bounds of their errors.
+        """
+        promises = (Lipschitz(0 * sums.value + self.lipschitz),)
+        return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
+
+
+@dataclass(frozen=True, eq=False)
+class _BlobsEvaluator(FormulaEvaluator):
+    """The evaluator of blobs.
+
+    blobs: the blobs on the backend, which are also the formula.
+    """
+
+    blobs: _DeviceBlobs
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds
+        everywhere."""
+        return self.blobs.sample(self.blobs.value_at(p))
+
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the blobs nearby. There is no enclosure behind the point.
+
+        path: the ray.
+        t: a length along it.
+        ahead: the length in front of the point up to which proofs are wanted.
+        back: the same behind the point; not used.
+
+        In a grid, enclosures end where the ray leaves the cell of the point, enlarged by a margin:
+        up to there the cell's list of blobs is complete. If the cell is empty, f is 0 until the ray
+        comes to the first cell that is not empty. The enclosures then begin there and are proved
+        from that cell's list (`DelayedEnclosure`).
+        """
+        del back
+        p, d = path.point(t), path.direction
+        blobs = self.blobs
+        piece_count = PIECES if blobs.grid is None else PIECES_IN_CELL
+        # The proofs are asked first at which knots they want ranges of derivatives; those are then
+        # computed in the one loop over the blobs.
+        recorder = KnotRecorder(piece_count)
+        no_slope = SlopeRange(0.0, 0.0)  # in place of the slope, which is not needed for this
+        path.proofs.from_restriction(recorder, no_slope, ahead)
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
+        if recorder.knots is None:
+            return path.enclose(self.evaluate(p))
+        empty_length: Real | None = None
+        piece_start, length = p, fmin(ahead, blobs.max_path_length)
+        if blobs.grid is not None:
+            empty_length = skipped = blobs.grid.empty_run(p, d, ahead)
+            piece_start = dr.fma(type(p)(skipped), d, p)
+            # Behind an empty run the length counts from the first cell that is not empty, so
+            # `ahead` says nothing about it.
+            to_exit = blobs.grid.cell(piece_start).exit_distance(d)
+            length = fmin(
+                dr.select(skipped > 0, to_exit, fmin(ahead, to_exit)), blobs.max_path_length
+            )
+        # The knots for the final length.
+        path.proofs.from_restriction(recorder, no_slope, length)
+        enclosures: tuple[Enclosure, ...]
+        if blobs.groups is None:
+            sums = sum_along(
+                blobs.kernel,
+                blobs.backend,
+                piece_start,
+                d,
+                recorder.knots,
+                blobs.near(piece_start),
+                signed=blobs.has_negative_weights,
+            )
+            start = (
+                # The sum is that at `piece_start`; at p, in an empty cell, f is 0.
+                sums.start if empty_length is None else _zero_where(empty_length > 0, sums.start)
+            )
+            slope = dr.dot(start.gradient, d)
+            slopes = SlopeRange.around(slope, start.gradient_error)
+            enclosures = path.proofs.from_restriction(sums, slopes, length)
+        else:
+            # The value at p, not at `piece_start`: over an empty length both are 0.
+            start = blobs.value_at(p)
+            slope = dr.dot(start.gradient, d)
+            enclosures = (
+                GroupMaximumEnclosure(
+                    blobs.kernel, blobs.grouped(piece_start), path, piece_start, start.value,
+                    recorder.knots, length, blobs.has_negative_weights,
+                ),
+            )  # fmt: skip
+        if empty_length is not None:
+            enclosures = tuple(
+                DelayedEnclosure(empty_length, enclosure) for enclosure in enclosures
+            )
+        # The next sample's proofs should reach as many of this step's lengths as there are pieces.
+        return RaySample(blobs.sample(start), enclosures, (), slope, float(piece_count))
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the Hessian of f at points p. If blobs have groups, it is the Hessian
+        of the largest of the groups' sums at p, which `FormulaEvaluator.hessian` computes with
+        jets."""
+        blobs = self.blobs
+        if blobs.groups is not None:
+            return super().hessian(p)
+        xx, xy, xz, yy, yz, zz = hessian_at(blobs.kernel, blobs.backend, p, blobs.near(p))
+        vector = blobs.backend.Array3f
+        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
 
 def _blob_records(backend: Backend, blobs: Blobs) -> FloatArray:
@@ -453,21 +469,6 @@ def _zero_where(mask: Any, sums: SumValue) -> SumValue:
         dr.select(mask, zero, sums.error),
         dr.select(mask, zero, sums.gradient_error),
     )
-
-
-def _backend_number(*jets: Jet) -> Any:
-    """Any Dr.Jit number among the ends of the intervals of jets. It tells the backend and the
-    number of lanes.
-
-    Raises:
-        TypeError: all ends are Python numbers.
-    """
-    for jet in jets:
-        for interval in (jet.value, *jet.first_derivatives):
-            for bound in (interval.lower, interval.upper):
-                if dr.is_array_v(cast("Any", type(bound))):
-                    return bound
-    raise TypeError("blobs need a point of the backend: the coordinates are constants")
 
 
 def _checked(

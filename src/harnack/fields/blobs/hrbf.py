@@ -8,7 +8,6 @@ the values and the derivatives of a function."""
 
 from __future__ import annotations
 
-import copy
 import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -29,23 +28,26 @@ from harnack.backend.validation import (
 from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.batched_fields import cached_upload
 from harnack.fields.blobs.blob_sums import (
     PIECES,
     KnotRecorder,
     State,
     SumOnRay,
     SumValue,
+    backend_number,
     for_each_record,
     sum_jets,
 )
-from harnack.fields.formula import Formula, is_jet
+from harnack.fields.evaluator import POINTS, EvaluateOnly, Plan
+from harnack.fields.formula import Formula, FormulaEvaluator, is_jet
 from harnack.geometry import Box
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.formula import FormulaFunction
     from harnack.geometry import Volume
 
 
@@ -89,18 +91,6 @@ class HRBF(Formula):
         margin = _MARGIN * float((upper - lower).max())
         self.domain = Box(lower - margin, upper + margin) if domain is None else domain
         self.lipschitz = self._largest_gradient()
-        # Set by `prepare`: the backend, and the table of the points' records on it.
-        self._on: tuple[Backend, RecordTable] | None = None
-
-    @cached_prepare
-    def prepare(self, backend: Backend) -> HRBF:
-        """The same field with its points uploaded to the backend. Code that Dr.Jit compiles for it
-        serves other points as well, because all numbers are data and none are literals."""
-        prepared = copy.copy(self)
-        prepared._on = self._uploaded(backend)
-        if self.lipschitz is not None:
-            prepared.lipschitz = dr.opaque(backend.Float, self.lipschitz)
-        return prepared
 
     def _largest_gradient(self) -> float | None:
         """A bound of |grad f| in the domain; None if the domain is unbounded.
@@ -118,8 +108,25 @@ class HRBF(Formula):
             1 + 1e-6
         )
 
-    def _uploaded(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and a table on it with one record (row of 16 numbers) for each point.
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        function = self._upload(backend)
+        return _HRBFEvaluator(self, function, function.lipschitz, function)
+
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        return self._upload(backend)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at jets of the coordinates (intervals that contain values and derivatives), or at
+        Dr.Jit numbers."""
+        number = backend_number(x, y, z) if is_jet(x, type(self).__name__) else x
+        return self._upload(backend_of(number))(x, y, z)
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> _DeviceFunction:
+        """The function on a backend, with a table of one record (row of 16 numbers) for each point.
+        Code that Dr.Jit compiles for it serves other points as well, because all numbers are data
+        and none are literals.
 
         A record holds, by columns: 0 to 2 the point, rounded to the precision of the backend; 3 to
         5 the rest of the point, which rounding has cut off; 6 the number a; 7 to 9 the vector 3 b;
@@ -135,67 +142,35 @@ class HRBF(Formula):
                 np.zeros((len(rounded_points), 6)),
             ]
         )
-        return backend, RecordTable.upload(backend, rows)
+        records = RecordTable.upload(backend, rows)
+        lipschitz = None if self.lipschitz is None else dr.opaque(backend.Float, self.lipschitz)
+        return _DeviceFunction(backend, type(self).__name__, records, lipschitz)
 
-    def _prepared_for(self, backend: Backend) -> tuple[Backend, RecordTable]:
-        """The backend, and the table of the points' records (rows of numbers) on it. They are
-        uploaded now unless `prepare` has done so."""
-        return self._uploaded(backend) if self._on is None else self._on
+    def describe(self) -> dict[str, Any]:
+        """The number of points, as a dictionary for users."""
+        return {"points": len(self.points)}
 
-    def evaluate(self, p: Vec3) -> Sample:
-        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds in
-        the domain."""
-        # Any direction will do: with a single knot no derivative along the line is computed.
-        d = type(p)(1, 0, 0)
-        return self._sample(self._along(p, d, (0.0,)).start)
 
-    def _sample(self, sums: SumValue) -> Sample:
-        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
-        Lipschitz constant that holds in the domain.
+@dataclass(frozen=True, eq=False)
+class _DeviceFunction:
+    """The function f of `HRBF` on a backend. Called with three coordinates, it is the formula of f.
 
-        sums: value and gradient of f at the points, with bounds of their errors.
-        """
-        promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
-        return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
+    name: the name of the field's class, for messages.
+    records: a table with one record (row of 16 numbers) for each point.
+    lipschitz: a bound of |grad f| in the domain; None if the domain is unbounded.
+    """
 
-    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
-        point on which f takes none of the levels (the values that rays look for). It needs one loop
-        over the points p_i. There is no enclosure behind the point.
+    backend: Backend
+    name: str
+    records: RecordTable
+    lipschitz: Real | None
 
-        path: the ray.
-        t: a length along it.
-        ahead: the length in front of the point up to which proofs are wanted.
-        back: the same behind the point; not used.
-        """
-        del back
-        p, d = path.point(t), path.direction
-        # The proofs are asked first at which knots they want ranges of derivatives; those are then
-        # computed in the one loop over the points.
-        recorder = KnotRecorder()
-        length = ahead
-        # (The slope is not needed for this.)
-        path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
-        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
-        if recorder.knots is None:
-            return path.enclose(self.evaluate(p))
-        sums = self._along(p, d, recorder.knots)
-        slope = dr.dot(sums.start.gradient, d)
-        slopes = SlopeRange.around(slope, sums.start.gradient_error)
-        enclosures = path.proofs.from_restriction(sums, slopes, length)
-        # The next sample asks for enclosures up to as many lengths of this step as there are
-        # pieces.
-        return RaySample(self._sample(sums.start), enclosures, (), slope, PIECES)
-
-    def formula(self, x: Any, y: Any, z: Any) -> Any:
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
         """f at jets of the coordinates (intervals that contain values and derivatives), or at
         Dr.Jit numbers."""
-        if not is_jet(x, type(self).__name__):
-            return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        # Ends of intervals that are Dr.Jit numbers: they tell the backend.
-        numbers = (end for jet in (x, y, z) for entry in (jet.value, *jet.first_derivatives)
-                   for end in (entry.lower, entry.upper) if dr.is_array_v(type(end)))  # fmt: skip
-        backend, records = self._prepared_for(backend_of(next(numbers)))
+        if not is_jet(x, self.name):
+            points = EvaluateOnly(lambda p: self.sample(self.value_at(p)))
+            return points.differentiable_value(self.backend.Array3f(x, y, z))
 
         def term(row: list[Real]) -> Jet:
             """The jet of the term a r^3 + b . grad r^3 of one point, which is a r^3 + 3 r (b . v)
@@ -205,41 +180,24 @@ class HRBF(Formula):
             r = (u**2 + v**2 + w**2).apply(sqrt)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
 
-        return sum_jets(term, x, backend.Float(0), for_each_record(records))
+        return sum_jets(term, x, self.backend.Float(0), for_each_record(self.records))
 
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        """The three rows of the Hessian of f at p, by a sum over the points p_i."""
-        backend, records = self._prepared_for(backend_of(p))
-        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    def value_at(self, p: Vec3) -> SumValue:
+        """f at points p."""
+        # Any direction will do: with a single knot no derivative along the line is computed.
+        d = type(p)(1, 0, 0)
+        return self.along(p, d, (0.0,)).start
 
-        def add_point(row: list[Real], state: State) -> State:
-            """Return the sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`),
-            with the term of one more point added. row: the point's record."""
-            # The vector from the point; three times the vector b_i; the length of v, and 1/length.
-            v, b, r, inverse_r = _offset_of_point(p, row)
-            b_dot_e = dr.dot(b, v) * inverse_r
-            e = v * inverse_r
+    def sample(self, sums: SumValue) -> Sample:
+        """The sample at points: value, gradient, and, as the proved bound of f near the points, a
+        Lipschitz constant that holds in the domain.
 
-            def entry(i: int, j: int) -> Real:
-                """The second derivative of the point's term by coordinates i and j.
+        sums: value and gradient of f at the points, with bounds of their errors.
+        """
+        promises = () if self.lipschitz is None else (Lipschitz(0 * sums.value + self.lipschitz),)
+        return Sample(sums.value, sums.gradient, promises, sums.error, sums.gradient_error)
 
-                Let v be the vector from the point, r its length and e = v/r; let a be the number of
-                the point's record, and b the vector of its entries 7 to 9. With the indices i and j
-                for components of vectors, the derivative is 3 a (r delta_ij + v_i e_j) + (b . e)
-                (delta_ij - e_i e_j) + b_i e_j + b_j e_i.
-                """
-                delta = 1.0 if i == j else 0.0
-                vector_part = b_dot_e * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
-                return 3 * row[6] * (r * delta + v[i] * e[j]) + vector_part
-
-            return tuple(total + entry(*pair) for total, pair in zip(state, pairs, strict=True))
-
-        zero = tuple(backend.Float(0) for _ in pairs)
-        xx, xy, xz, yy, yz, zz = records.for_each(add_point, zero, "points")
-        vector = backend.Array3f
-        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
-
-    def _along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> SumOnRay:
+    def along(self, p: Vec3, d: Vec3, knots: Sequence[Real]) -> SumOnRay:
         """f along the paths p + s d, with ranges of its first two derivatives by s on the pieces
         between knots.
 
@@ -266,7 +224,7 @@ class HRBF(Formula):
         r is the smallest distance from p_i on the path. A sum of n terms adds n roundings of the
         sum of |a| m^3 + |b| m^2, of 3 |a| m^2 + 3 |b| m and of 6 |a| m + 3 |b|.
         """
-        backend, records = self._prepared_for(backend_of(p))
+        backend, records = self.backend, self.records
         real = backend.Float
         count = len(knots) - 1
         roundoff = 0.5 * backend.machine_epsilon
@@ -396,17 +354,90 @@ class HRBF(Formula):
             )
         return SumOnRay(start, tuple(pieces))
 
-    def describe(self) -> dict[str, Any]:
-        """The number of points, as a dictionary for users."""
-        return {"points": len(self.points)}
+
+@dataclass(frozen=True, eq=False)
+class _HRBFEvaluator(FormulaEvaluator):
+    """The evaluator of `HRBF`.
+
+    function: the function on the backend, which is also the formula.
+    """
+
+    function: _DeviceFunction
+
+    def evaluate(self, p: Vec3) -> Sample:
+        """The sample at p: the value and the gradient of f, and a Lipschitz constant that holds in
+        the domain."""
+        return self.function.sample(self.function.value_at(p))
+
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The sample at the position t of a ray, with enclosures: proofs of lengths in front of the
+        point on which f takes none of the levels (the values that rays look for). It needs one loop
+        over the points p_i. There is no enclosure behind the point.
+
+        path: the ray.
+        t: a length along it.
+        ahead: the length in front of the point up to which proofs are wanted.
+        back: the same behind the point; not used.
+        """
+        del back
+        p, d = path.point(t), path.direction
+        # The proofs are asked first at which knots they want ranges of derivatives; those are then
+        # computed in the one loop over the points.
+        recorder = KnotRecorder()
+        length = ahead
+        # (The slope is not needed for this.)
+        path.proofs.from_restriction(recorder, SlopeRange(0.0, 0.0), length)
+        # No proof asks for ranges of derivatives: those from the Lipschitz constant are used.
+        if recorder.knots is None:
+            return path.enclose(self.evaluate(p))
+        sums = self.function.along(p, d, recorder.knots)
+        slope = dr.dot(sums.start.gradient, d)
+        slopes = SlopeRange.around(slope, sums.start.gradient_error)
+        enclosures = path.proofs.from_restriction(sums, slopes, length)
+        # The next sample asks for enclosures up to as many lengths of this step as there are
+        # pieces.
+        return RaySample(self.function.sample(sums.start), enclosures, (), slope, PIECES)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        """The three rows of the Hessian of f at p, by a sum over the points p_i."""
+        backend, records = self.function.backend, self.function.records
+        pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+        def add_point(row: list[Real], state: State) -> State:
+            """Return the sums so far of the second derivatives xx, xy, xz, yy, yz, zz (`state`),
+            with the term of one more point added. row: the point's record."""
+            # The vector from the point; three times the vector b_i; the length of v, and 1/length.
+            v, b, r, inverse_r = _offset_of_point(p, row)
+            b_dot_e = dr.dot(b, v) * inverse_r
+            e = v * inverse_r
+
+            def entry(i: int, j: int) -> Real:
+                """The second derivative of the point's term by coordinates i and j.
+
+                Let v be the vector from the point, r its length and e = v/r; let a be the number of
+                the point's record, and b the vector of its entries 7 to 9. With the indices i and j
+                for components of vectors, the derivative is 3 a (r delta_ij + v_i e_j) + (b . e)
+                (delta_ij - e_i e_j) + b_i e_j + b_j e_i.
+                """
+                delta = 1.0 if i == j else 0.0
+                vector_part = b_dot_e * (delta - e[i] * e[j]) + b[i] * e[j] + b[j] * e[i]
+                return 3 * row[6] * (r * delta + v[i] * e[j]) + vector_part
+
+            return tuple(total + entry(*pair) for total, pair in zip(state, pairs, strict=True))
+
+        zero = tuple(backend.Float(0) for _ in pairs)
+        xx, xy, xz, yy, yz, zz = records.for_each(add_point, zero, "points")
+        vector = backend.Array3f
+        return vector(xx, xy, xz), vector(xy, yy, yz), vector(xz, yz, zz)
 
 
 @dataclass(frozen=True)
 class _TermFunctions:
     """The values at a position x on a line of five functions of x, whose ranges bound the
-    derivatives of one point's term along the line (`HRBF._along`). Here x is measured from the
-    point of the line nearest to the point p_i of the term, h is the distance of the line from p_i,
-    r^2 = h^2 + x^2 and u = x/r. `bowl` and `bell` are named by the shapes of their graphs."""
+    derivatives of one point's term along the line (`_DeviceFunction.along`). Here x is measured
+    from the point of the line nearest to the point p_i of the term, h is the distance of the line
+    from p_i, r^2 = h^2 + x^2 and u = x/r. `bowl` and `bell` are named by the shapes of their
+    graphs."""
 
     lift: Real  # r x
     sine: Real  # u

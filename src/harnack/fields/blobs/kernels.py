@@ -154,7 +154,7 @@ class BlobKernel(abc.ABC):
         """Intervals that contain all values of the kernel k(q), of dk/dq and of d2k/dq2 (three
         intervals) for squared distances q >= 0 in an interval."""
 
-    def prepare(self, backend: Backend) -> BlobKernel:
+    def on_backend(self, backend: Backend) -> BlobKernel:
         """This kernel with its numbers as Dr.Jit arrays of the backend that are not literals:
         Dr.Jit then need not compile its code again if they change. By default the kernel itself,
         for kernels without such numbers."""
@@ -495,7 +495,7 @@ class GaussianKernel(BlobKernel):
         center and the radius of the blob.
     tail: the value of the Gaussian where the blob ends, as a fraction of its value at the blob's
         radius.
-    rate: b as a Dr.Jit number, which `prepare` sets; None otherwise.
+    rate: b as a Dr.Jit number, which `on_backend` sets; None otherwise.
 
     Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
     line's part inside the support is |x| <= S. With z = b (S^2 - x^2) and y = b x^2,
@@ -529,7 +529,7 @@ class GaussianKernel(BlobKernel):
     @property
     def _rate(self) -> Any:
         """The number b of the kernel exp(z) - 1 - z with z = b (1 - q): a Dr.Jit number if the
-        kernel is prepared for a backend, else a Python number."""
+        kernel is on a backend, else a Python number."""
         return self.sharpness * self.support**2 if self.rate is None else self.rate
 
     @property
@@ -543,7 +543,7 @@ class GaussianKernel(BlobKernel):
             4 * b * exp_b, 8 * b * (1 + math.sqrt(b)) * exp_b, 16 * b * (1 + b) * exp_b
         )
 
-    def prepare(self, backend: Backend) -> BlobKernel:
+    def on_backend(self, backend: Backend) -> BlobKernel:
         return GaussianKernel(
             self.sharpness, self.tail, dr.opaque(backend.Float, float(self._rate))
         )

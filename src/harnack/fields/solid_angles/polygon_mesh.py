@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -26,8 +26,10 @@ from harnack.backend.elementary import fmin
 from harnack.backend.record_table import RecordTable
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
-from harnack.fields.field import Field, Ray, RaySample, Sample, space_scaled
-from harnack.fields.patch_boxes import PatchBoxes, PatchField
+from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled
+from harnack.fields.batched_fields import cached_upload
+from harnack.fields.evaluator import Evaluator
+from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fmm.curve_queries import lift_ball, remainder_promises
 from harnack.fmm.edges import (
@@ -115,8 +117,7 @@ class FaceLoops:
         return cls(RecordTable.upload(backend, heads), edges)
 
     def face(self, index: Any) -> FaceSolidAngle:
-        """The solid angle of the face with this index, as a field. The index may differ from lane
-        to lane."""
+        """The solid angle of the face with this index. The index may differ from lane to lane."""
         row = self.heads.read_record(index)  # self.heads: one record for each face
         backend = self.heads.backend
         integer = backend.UInt32
@@ -144,22 +145,20 @@ class FaceData(UnitFrame):
     value_rounding: Real
 
 
-class FaceSolidAngle(Field):
-    """The solid angle f of the boundary of one face, as a field with period 4 pi. The face may
-    differ from lane to lane. The lift of f is the continuous function near a point that equals f
-    modulo 4 pi.
+@dataclass(frozen=True, eq=False)
+class FaceSolidAngle(Evaluator):
+    """The evaluator of the solid angle f of the boundary of one face, with period 4 pi. The face
+    may differ from lane to lane. The lift of f is the continuous function near a point that equals
+    f modulo 4 pi.
+
+    face: the face, on a backend.
 
     Its promises, proved bounds of f near a point, are those of `SolidAngle`, which has the proofs.
     They include a ball and a range of the lift on it. The range is that of `lift_bound="convex"` if
     the face is in convex position, and that of "edges" otherwise.
     """
 
-    period: ClassVar[float | None] = PERIOD
-    default_level: float = 2 * math.pi
-
-    def __init__(self, face: FaceData) -> None:
-        """Make the field. face: the face, on a backend."""
-        self.face = face
+    face: FaceData
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of f at points p: value, gradient, error bounds and proved bounds of f near
@@ -454,7 +453,7 @@ def _are_empty(
 _LEVEL_MARGIN = 1e-9 * PERIOD
 
 
-class PolygonMesh(PatchField["_MeshBuffers"]):
+class PolygonMesh(PatchField):
     """Faces of any number of corners, flat or not, each spanned by a smooth surface: the level set
     of the solid angle of its boundary curve (paper, Sections 4.2.1 and 4.2.4). The field has a
     *patch* for each face, the solid angle of that face. Which face is meant may differ from lane to
@@ -479,11 +478,14 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
     over_relaxation: float = 1.3  # as for `SolidAngle`
+    no_single_function = (
+        "a polygon mesh is no level set of one function, but of one for each face: ask a "
+        "face, such as mesh.face(0), which is a harnack.SolidAngle"
+    )
 
     def __init__(self, vertices: Any, faces: Any) -> None:
         """Validate vertices (n, 3) and faces, a list of polygons: each is a list of indices of
         vertices, or a list of such loops."""
-        super().__init__()
         self.faces: PolygonFaces = validate_polygons(vertices, faces)
         if self.faces.face_count >= MAX_BOXES:
             raise ValueError(
@@ -530,29 +532,16 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
         (m, 3). The surface of a face consists of the level sets of the solid angle of its boundary.
         The boxes are computed once for the same levels.
 
-        levels: values of the solid angle; None for the levels of this mesh.
+        levels: values of the solid angle; None for the default level.
         """
-        levels = self.levels if levels is None else levels
+        levels = (self.default_level,) if levels is None else levels
         return self._boxes.get_or_make(levels, lambda: face_boxes(self.faces, levels))
 
-    def evaluate(self, p: Vec3) -> NoReturn:
-        """Not defined: there is a function for each face, but none for the mesh. Always raises
-        TypeError."""
-        del p
-        raise TypeError(
-            "a polygon mesh is no level set of one function, but of one for each face: ask a "
-            "face, such as mesh.face(0), which is a harnack.SolidAngle"
-        )
-
-    def _upload(self, backend: Backend) -> _MeshBuffers:
+    @cached_upload
+    def _upload(self, backend: Backend, levels: tuple[float, ...]) -> _FacePatches:
         """Copy the boxes of all faces and their boundary curves to a backend."""
-        boxes = PatchBoxes.upload(backend, *self.boxes())
-        return _MeshBuffers(boxes, FaceLoops.upload(backend, self.faces))
-
-    def patch(self, index: Any) -> Field:
-        """The solid angle of the face with this index, as a field on the device. The index may
-        differ from lane to lane."""
-        return self._require_data().curves.face(index)
+        boxes = PatchBoxes.upload(backend, *self.boxes(levels))
+        return _FacePatches(boxes, FaceLoops.upload(backend, self.faces))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level that is a multiple of 4 pi: its surfaces would be
@@ -577,12 +566,13 @@ class PolygonMesh(PatchField["_MeshBuffers"]):
 
 
 @dataclass(frozen=True)
-class _MeshBuffers:
-    """What tracing a polygon mesh needs on a backend.
+class _FacePatches(PatchesInBoxes):
+    """The faces of a polygon mesh on a backend.
 
-    boxes: the boxes that contain the surfaces of faces.
     curves: the boundary curves of all faces.
     """
 
-    boxes: PatchBoxes
     curves: FaceLoops
+
+    def patch(self, index: Any) -> Evaluator:
+        return self.curves.face(index)

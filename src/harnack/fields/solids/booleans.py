@@ -8,7 +8,6 @@ it."""
 
 from __future__ import annotations
 
-import copy
 import math
 import numbers
 from collections.abc import Callable, Iterable
@@ -26,9 +25,18 @@ from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field
-from harnack.fields.formula import prepare_value, probe_jets
-from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField, not_a_solid
+from harnack.fields.formula import on_backend, probe_jets
+from harnack.fields.solids.solid import (
+    EvaluatorOfInner,
+    FormulaSolid,
+    Solid,
+    SolidOfField,
+    formula_of,
+    not_a_solid,
+    without_levels,
+)
 from harnack.geometry import Box, VolumeIntersection
 
 if TYPE_CHECKING:
@@ -153,46 +161,64 @@ class BooleanSolid(Solid):
         return _box_around_volumes(bounded)
 
     @property
-    def is_steep(self) -> bool:
-        return any(part.is_steep for part in self.parts)
+    def has_variable_accuracy(self) -> bool:
+        return any(part.has_variable_accuracy for part in self.parts)
 
-    def prepare(self, backend: Backend) -> Solid:
-        return self._with_parts([part.prepare(backend) for part in self.parts])
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return _extremum([part.formula(x, y, z) for part in self.parts], is_union=self.is_union)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> BooleanSolidEvaluator:
+        parts = tuple(part.evaluator(backend, plan) for part in self.parts)
+        return BooleanSolidEvaluator(parts, self.is_union)
+
+
+def _extremum(values: list[Any], *, is_union: bool) -> Any:
+    """The smallest (for a union) or the largest (for an intersection) of the values of operands,
+    which are numbers of any arithmetic."""
+    if len(values) == 1:
+        return values[0]
+    return minimum(*values) if is_union else maximum(*values)
+
+
+@dataclass(frozen=True, eq=False)
+class BooleanSolidEvaluator(Evaluator):
+    """The evaluator of the minimum or the maximum of functions f_i, those of the operands. It is
+    computed as `BooleanSolid` describes.
+
+    parts: the evaluators of the operands.
+    is_union: True for the minimum, False for the maximum.
+    """
+
+    parts: tuple[Evaluator, ...]
+    is_union: bool
 
     @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
+    def is_steep(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return any(part.is_steep for part in self.parts)
+
+    @property
+    def variable_accuracy(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> VariableAccuracy | None:
         """How f is sampled with different accuracy: all operands that can be sampled so have the
         same accuracy scale (larger is more accurate). None if there is no such operand."""
         accuracies = [part.variable_accuracy for part in self.parts]
         known = [accuracy for accuracy in accuracies if accuracy is not None]
 
-        def at(scale: Real) -> Field:
+        def at(scale: Real) -> Evaluator:
             """The combination, with its operands sampled at this accuracy scale."""
             pairs = zip(self.parts, accuracies, strict=True)
-            return self._with_parts([part if a is None else a.at(scale) for part, a in pairs])
+            parts = tuple(part if a is None else a.at(scale) for part, a in pairs)
+            return BooleanSolidEvaluator(parts, self.is_union)
 
         # `coarsest` is the accuracy scale of the coarsest samples that an operand has.
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
 
-    def for_ray_count(self, count: int) -> Field:
-        def make(parts: list[Any]) -> Solid:
-            """The same combination (union or intersection) of other operands, `parts`."""
-            return BooleanSolid(tuple(parts), self.is_union)
-
-        return self._for_rays(self.parts, count, make)
-
-    def _with_parts(self, parts: list[Field]) -> Solid:
-        """The same combination (union or intersection) of other operands, `parts`. These may be any
-        fields."""
-        combination = copy.copy(self)
-        object.__setattr__(combination, "parts", tuple(parts))
-        return combination
-
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [part.formula(x, y, z) for part in self.parts]
-        if len(values) == 1:
-            return values[0]
-        return minimum(*values) if self.is_union else maximum(*values)
+        """f at coordinates that are numbers of any arithmetic. Raises TypeError if an operand has
+        no formula."""
+        values = [formula_of(part)(x, y, z) for part in self.parts]
+        return _extremum(values, is_union=self.is_union)
 
     def evaluate(self, p: Vec3) -> Sample:
         samples = [part.evaluate(p) for part in self.parts]
@@ -441,15 +467,26 @@ class Complement(SolidOfField):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return -self.field.formula(x, y, z)
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        return _ComplementEvaluator(self.field.evaluator(backend, without_levels(plan)))
+
+
+class _ComplementEvaluator(EvaluatorOfInner):
+    """The evaluator of -f, from that of f."""
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """-f at coordinates that are numbers of any arithmetic."""
+        return -formula_of(self.inner)(x, y, z)
+
     def evaluate(self, p: Vec3) -> Sample:
-        return negated_sample(self.field.evaluate(p))
+        return negated_sample(self.inner.evaluate(p))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        x, y, z = self.field.hessian(p)
+        x, y, z = self.inner.hessian(p)
         return -x, -y, -z
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        return negated_look(self.field.sample_ray(path, t, ahead, back))
+        return negated_look(self.inner.sample_ray(path, t, ahead, back))
 
 
 def negated_look(look: RaySample) -> RaySample:
@@ -498,16 +535,29 @@ class OffsetSolid(SolidOfField):
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.field.sublevel_extent(level + self.distance, above=above)
 
-    def prepare(self, backend: Backend) -> Solid:
-        prepared = super().prepare(backend)
-        object.__setattr__(prepared, "distance", prepare_value(self.distance, backend))
-        return prepared
-
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.field.formula(x, y, z) - self.distance
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        inner = self.field.evaluator(backend, without_levels(plan))
+        return _OffsetSolidEvaluator(inner, on_backend(self.distance, backend))
+
+
+@dataclass(frozen=True, eq=False)
+class _OffsetSolidEvaluator(EvaluatorOfInner):
+    """The evaluator of f - distance, from that of f.
+
+    distance: a kernel parameter.
+    """
+
+    distance: Real
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f - distance at coordinates that are numbers of any arithmetic."""
+        return formula_of(self.inner)(x, y, z) - self.distance
+
     def evaluate(self, p: Vec3) -> Sample:
-        return self._shifted(self.field.evaluate(p))
+        return self._shifted(self.inner.evaluate(p))
 
     def _shifted(self, sample: Sample) -> Sample:
         """The sample of f - distance, from the sample of f at the same point. The bound of the
@@ -521,10 +571,10 @@ class OffsetSolid(SolidOfField):
         )
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self.field.hessian(p)
+        return self.inner.hessian(p)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        ray_sample = self.inner.sample_ray(path, t, ahead, back)
         return replace(ray_sample, sample=self._shifted(ray_sample.sample))
 
 
@@ -545,6 +595,7 @@ class BlendedSolid(FormulaSolid):
     """
 
     is_cheap = False
+    literals = ("power",)  # the ranges of x^p depend on the kind of number that p is
 
     parts: tuple[Solid, Solid]
     radius: Any
@@ -615,13 +666,3 @@ class BlendedSolid(FormulaSolid):
         a, b = (part.formula(x, y, z) for part in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)
-
-    def prepare(self, backend: Backend) -> Solid:
-        """The same blend with its operands prepared, and its radius as a kernel parameter of the
-        backend."""
-        prepared = copy.copy(self)
-        parts = tuple(part.prepare(backend) for part in self.parts)
-        object.__setattr__(prepared, "parts", parts)
-        # The power stays a literal: the ranges of x^p depend on the kind of number that p is.
-        object.__setattr__(prepared, "radius", prepare_value(self.radius, backend))
-        return prepared

@@ -7,7 +7,6 @@ are, relative to the distance of the points."""
 from __future__ import annotations
 
 import abc
-import copy
 import math
 import numbers
 from dataclasses import dataclass
@@ -20,16 +19,26 @@ from harnack.arithmetic import cos, maximum, minimum, sin
 from harnack.arithmetic.operators import tally_of
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
-from harnack.fields.field import Field
-from harnack.fields.formula import probe_jets, with_device_numbers
-from harnack.fields.solids.solid import FormulaSolid, Solid
+from harnack.fields.evaluator import POINTS, Plan
+from harnack.fields.formula import (
+    FormulaEvaluator,
+    FormulaFunction,
+    probe_jets,
+    with_device_numbers,
+)
+from harnack.fields.solids.solid import (
+    AXES,
+    FormulaSolid,
+    Solid,
+    SpaceMap,
+    axis_index,
+    formula_of,
+)
 from harnack.geometry import Ball, Box
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.geometry import Volume
-
-from harnack.fields.solids.solid import AXES, SpaceMap, axis_index
 
 
 class Deformation(SpaceMap):
@@ -110,28 +119,58 @@ class DeformedSolid(FormulaSolid):
         """Whether f may jump: whether the inner solid's formula may, as the map is continuous."""
         return tally_of(self.inner.formula).may_jump
 
-    def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        """A Lipschitz constant of f on a ball about p, as a promise (a proved bound near p): the
-        constant of the inner solid times that of the inverse map; () if the inner solid has no
-        constant."""
-        constant = self.inner.lipschitz
-        if constant is None:
-            return ()
-        stretch, radius = self.map.preimage_lipschitz(p)
-        return (Lipschitz(constant * stretch, radius),)
-
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         return self.map.volume(self.inner.sublevel_extent(level, above=above))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.inner.formula(*self.map.preimage(x, y, z))
 
-    def prepare(self, backend: Backend) -> Field:
-        prepared = copy.copy(self)
-        object.__setattr__(prepared, "inner", self.inner.prepare(backend))
-        object.__setattr__(prepared, "map", self.map.prepare(backend))
-        object.__setattr__(prepared, "_prepared_tally", self.tally)
-        return prepared
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        return _DeformedFormula(self.inner.formula_on(backend), self.map.prepare(backend))
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        inner, change = self.inner.evaluator(backend), self.map.prepare(backend)
+        # The constant of the inner solid; on the backend, if it is a formula.
+        constant = inner.lipschitz if isinstance(inner, FormulaEvaluator) else self.inner.lipschitz
+        formula = _DeformedFormula(formula_of(inner), change)
+        return _DeformedSolidEvaluator(self, formula, self.lipschitz, constant, change)
+
+
+@dataclass(frozen=True, eq=False)
+class _DeformedFormula:
+    """The function of a deformed solid.
+
+    inner: the function of the inner solid.
+    map: the deformation.
+    """
+
+    inner: FormulaFunction
+    map: Deformation
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        return self.inner(*self.map.preimage(x, y, z))
+
+
+@dataclass(frozen=True, eq=False)
+class _DeformedSolidEvaluator(FormulaEvaluator):
+    """The evaluator of a `DeformedSolid`.
+
+    constant: a Lipschitz constant of the inner solid; None if none is known.
+    map: the deformation.
+    """
+
+    constant: Any
+    map: Deformation
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        """A Lipschitz constant of f on a ball about p, as a promise (a proved bound near p): the
+        constant of the inner solid times that of the inverse map; () if the inner solid has no
+        constant."""
+        if self.constant is None:
+            return ()
+        stretch, radius = self.map.preimage_lipschitz(p)
+        return (Lipschitz(self.constant * stretch, radius),)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ of f along a ray."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,9 +24,10 @@ from harnack.backend.validation import as_finite, as_positive
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.batched_fields import cached_upload
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.formula import is_jet
-from harnack.fields.solids.deformations import Taper, Twist
+from harnack.fields.solids.deformations import Deformation, Taper, Twist
 from harnack.fields.solids.outline_distance import (
     OutlineEdges,
     OutlineSample,
@@ -144,31 +144,72 @@ class Extrusion(Solid):
             (float(center_x), float(center_y), half_height),
         )
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Extrusion:
-        """The same solid with its edges and numbers on the backend."""
-        prepared = copy.copy(self)
-        set_frozen(prepared, "_outline", OutlineEdges.upload(backend, self.loops))
-        set_frozen(prepared, "_half", dr.opaque(backend.Float, 0.5 * self.height))
-        for name in ("_turning", "_tapering"):
-            deform = getattr(self, name)
-            set_frozen(prepared, name, None if deform is None else deform.prepare(backend))
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _ExtrusionEvaluator:
+        del plan
+        max_scale = max(1.0, self.taper)
+        return _ExtrusionEvaluator(self._upload(backend), self.is_straight, max_scale)
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> _ExtrusionData:
+        """Upload the edges and the numbers of the solid to a backend."""
+        outline = OutlineEdges.upload(backend, self.loops)
+        half = dr.opaque(backend.Float, 0.5 * self.height)
+        twist, taper = (
+            None if deform is None else deform.prepare(backend)
+            for deform in (cast("Any", self)._turning, cast("Any", self)._tapering)
+        )
+        return _ExtrusionData(outline, half, twist, taper)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.formula_on(_backend_of_coordinate(x, type(self).__name__))(x, y, z)
+
+    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
+        return self.evaluator(backend).formula
+
+
+@dataclass(frozen=True)
+class _ExtrusionData:
+    """The data of an extruded outline on a backend.
+
+    outline: the edges of the outline.
+    half: half of the height.
+    twist, taper: the maps by which the straight solid is deformed, with their numbers on the
+        backend; None for none.
+    """
+
+    outline: OutlineEdges
+    half: Real
+    twist: Deformation | None
+    taper: Deformation | None
+
+
+@dataclass(frozen=True, eq=False)
+class _ExtrusionEvaluator(Evaluator):
+    """The evaluator of an `Extrusion`.
+
+    data: the edges and the numbers of the solid.
+    is_straight: whether the solid has neither twist nor taper.
+    max_scale: the largest factor by which its cross sections are scaled.
+    """
+
+    data: _ExtrusionData
+    is_straight: bool
+    max_scale: float
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample of f at p. Without twist and taper it follows from the signed distance of (x,
         y) from the outline. Otherwise the outline is sampled at the preimage of p (the point that
         twist and taper move to p). Proved ranges of the preimage and of its derivatives then give
         the gradient by the chain rule, and the errors."""
-        solid = _prepared_for(self, p)
+        outline = self.data.outline
         if self.is_straight:
-            planar = solid._outline.sample(p.x, p.y)
-            return solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+            planar = outline.sample(p.x, p.y)
+            return self._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
         # Jets (ranges of value and derivatives) of the preimage's coordinates.
-        x, y, _ = solid._preimage(*Jet.at_point(p))
+        x, y, _ = self._preimage(*Jet.at_point(p))
         zero = 0 * p.x
         u, v = (zero + component.value.midpoint for component in (x, y))
-        planar = solid._outline.sample(u, v)
+        planar = outline.sample(u, v)
         # A bound of the error of the preimage's position. Then the components of the gradient of
         # the outline's distance as a function of p, as ranges: the chain rule, with the planar
         # gradient times the derivatives a and b of the preimage's x and y.
@@ -180,7 +221,7 @@ class Extrusion(Solid):
         gradient = cast("Any", type(p))(
             *(zero + component.midpoint for component in gradient_ranges)
         )
-        constant, radius = solid._preimage_lipschitz(p)
+        constant, radius = self._preimage_lipschitz(p)
         error = (
             sum((component.radius for component in gradient_ranges), zero)
             + planar.gradient_error * constant
@@ -188,7 +229,7 @@ class Extrusion(Solid):
         # The distance changes by at most as much as the preimage, which `spread` bounds; the bound
         # is doubled as a margin.
         moved = OutlineSample(planar.value, planar.gradient, planar.error + 2 * spread, error)
-        return solid._sample_of_outline(p, moved, gradient, Lipschitz(constant, radius))
+        return self._sample_of_outline(p, moved, gradient, Lipschitz(constant, radius))
 
     def _sample_of_outline(
         self, p: Vec3, side: OutlineSample, gradient: Vec3, promise: Lipschitz | None = None
@@ -200,7 +241,7 @@ class Extrusion(Solid):
         promise: a Lipschitz constant of f near p; None for the constant 1 everywhere.
         """
         epsilon = 2 * float(dr.epsilon(type(p.x)))  # the machine epsilon
-        half = cast("Any", self)._half
+        half = self.data.half
         end_distance = dr.abs(p.z - half) - half
         # f, and its derivatives by the two distances.
         value, side_weight, end_weight = _corner(side.value, end_distance)
@@ -236,9 +277,7 @@ class Extrusion(Solid):
             sample = self.evaluate(p)
             min_norm = self._min_gradient_norm(sample)
             # A constant of about 1 proves a step of about |f| to the surface: twice that is enough.
-            path_constant = _prepared_for(self, p)._path_lipschitz(
-                p, d, fmin(ahead, 2 * dr.abs(sample.value))
-            )
+            path_constant = self._path_lipschitz(p, d, fmin(ahead, 2 * dr.abs(sample.value)))
             ray_sample = path.enclose(replace(sample, ray_promises=(path_constant,)))
             # The speed has no bound looking back.
             return replace(ray_sample, backward=(), min_gradient_norm=min_norm)
@@ -246,18 +285,17 @@ class Extrusion(Solid):
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        solid = _prepared_for(self, p)
-        outline: OutlineEdges = solid._outline
+        outline, half = self.data.outline, self.data.half
         # Positions on the ray at which the distance from the outline is bounded. The ray's
         # direction in the plane is (d.x, d.y), which is no longer than 1.
         knots = outline.knots(p.x, p.y, ahead)
         planar = outline.sample(p.x, p.y, (d.x, d.y), knots)
-        sample = solid._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
+        sample = self._sample_of_outline(p, planar, cast("Any", type(p))(*planar.gradient, 0))
         planar_slope = planar.gradient[0] * d.x + planar.gradient[1] * d.y
         planar_enclosure = SignedDistanceEnclosure.around(planar, planar_slope, knots)
-        height = p.z - solid._half
+        height = p.z - half
         enclosure = ExtrusionEnclosure(
-            sample.value, sample.value_error, planar_enclosure, height, solid._half, d.z
+            sample.value, sample.value_error, planar_enclosure, height, half, d.z
         )
         slope = dr.dot(sample.gradient, d)
         return RaySample(
@@ -267,18 +305,18 @@ class Extrusion(Solid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives)."""
-        if not is_jet(x, type(self).__name__):
+        if not is_jet(x, self.name):
             return self.differentiable_value(_vector(x, y, z))
-        solid = _prepared_for(self, x.piece_length)
-        u, v, w = solid._preimage(x, y, z)
+        u, v, w = self._preimage(x, y, z)
+        half = self.data.half
         return orthogonal_intersection(
-            outline_distance_jet(solid._outline.sample, u, v), abs(w - solid._half) - solid._half
+            outline_distance_jet(self.data.outline.sample, u, v), abs(w - half) - half
         )
 
     def _preimage(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The preimage of (x, y, z): the point that twist and taper move to (x, y, z). Coordinates
         may be numbers of any arithmetic."""
-        for deform in (cast("Any", self)._tapering, cast("Any", self)._turning):
+        for deform in (self.data.taper, self.data.twist):
             if deform is not None:
                 x, y, z = deform.preimage(x, y, z)
         return x, y, z
@@ -310,12 +348,12 @@ class Extrusion(Solid):
         least s q, and k at least 1/max(1, taper), k/(s q) is at least 1/(max(1, taper) c).
         """
         (promise,) = sample.promises
-        return _MIN_GRADIENT / (max(1.0, self.taper) * cast("Lipschitz", promise).constant)
+        return _MIN_GRADIENT / (self.max_scale * cast("Lipschitz", promise).constant)
 
     def _preimage_lipschitz(self, p: Vec3) -> tuple[Real, Real]:
         """A Lipschitz constant of the inverse of twist and taper (the map `_preimage`) on a ball
-        about p, and the radius of that ball. The class docstring has the proof."""
-        taper, twist = cast("Any", self)._tapering, cast("Any", self)._turning
+        about p, and the radius of that ball. The docstring of `Extrusion` has the proof."""
+        taper, twist = self.data.taper, self.data.twist
         # Without twist and taper: the constant 1 in all of space, on each lane.
         constant, radius = 0 * p.x + 1, 0 * p.x + dr.inf
         if taper is not None:
@@ -333,12 +371,10 @@ class Extrusion(Solid):
         return constant, radius
 
 
-def _prepared_for(solid: Any, like: Any) -> Any:
-    """The solid, prepared for a backend. A solid that is prepared already is returned as it is.
-
-    like: a number or a point of that backend.
-    """
-    return solid if hasattr(solid, "_outline") else solid.prepare(backend_of(like))
+def _backend_of_coordinate(x: Any, name: str) -> Backend:
+    """The backend of a coordinate of a formula: a Dr.Jit number or a jet. name: the name of the
+    field, for the message of an error."""
+    return backend_of(x.piece_length if is_jet(x, name) else x)
 
 
 def _vector(x: Real, y: Real, z: Real) -> Vec3:
@@ -601,15 +637,34 @@ class SolidOfRevolution(Solid):
         half = 0.5 * (upper - lower) + level
         return box_around((radius, radius, half), (0.0, 0.0, 0.5 * (lower + upper)))
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> SolidOfRevolution:
-        prepared = copy.copy(self)
-        set_frozen(prepared, "_outline", OutlineEdges.upload(backend, self.loops, axis=True))
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SolidOfRevolutionEvaluator:
+        del plan
+        return _SolidOfRevolutionEvaluator(self._upload(backend))
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> OutlineEdges:
+        """Upload the edges of the outline to a backend."""
+        return OutlineEdges.upload(backend, self.loops, axis=True)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        return self.formula_on(_backend_of_coordinate(x, type(self).__name__))(x, y, z)
+
+    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
+        return self.evaluator(backend).formula
+
+
+@dataclass(frozen=True, eq=False)
+class _SolidOfRevolutionEvaluator(Evaluator):
+    """The evaluator of a `SolidOfRevolution`.
+
+    outline: the edges of the outline.
+    """
+
+    outline: OutlineEdges
 
     def evaluate(self, p: Vec3) -> Sample:
         r, outward = _from_axis(p)
-        return self._sample(p, r, outward, _prepared_for(self, p)._outline.sample(r, p.z))
+        return self._sample(p, r, outward, self.outline.sample(r, p.z))
 
     def _sample(self, p: Vec3, r: Real, outward: tuple[Real, Real], side: OutlineSample) -> Sample:
         """The sample of f at p, from the sample of the signed distance from the outline at (r, z).
@@ -649,7 +704,7 @@ class SolidOfRevolution(Solid):
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        outline: OutlineEdges = _prepared_for(self, p)._outline
+        outline = self.outline
         r, (unit_x, unit_y) = _from_axis(p)
         knots = outline.knots(r, p.z, ahead)
         # The components of the ray's direction away from the axis and around it.
@@ -677,10 +732,11 @@ class SolidOfRevolution(Solid):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if not is_jet(x, type(self).__name__):
+        """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
+        derivatives)."""
+        if not is_jet(x, self.name):
             return self.differentiable_value(_vector(x, y, z))
-        solid = _prepared_for(self, x.piece_length)
-        return outline_distance_jet(solid._outline.sample, norm(x, y), z)
+        return outline_distance_jet(self.outline.sample, norm(x, y), z)
 
 
 def _from_axis(p: Vec3) -> tuple[Real, tuple[Real, Real]]:

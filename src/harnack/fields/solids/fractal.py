@@ -20,14 +20,20 @@ from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_finite, as_integer_in_range, as_positive
 from harnack.enclosures import Lipschitz, TaylorRemainder
-from harnack.fields.formula import Formula, is_jet, with_device_numbers
+from harnack.fields.evaluator import POINTS, Plan
+from harnack.fields.formula import (
+    Formula,
+    FormulaEvaluator,
+    FormulaFunction,
+    is_jet,
+    with_device_numbers,
+)
 from harnack.fields.solids.solid import FormulaSolid
 from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.enclosures import Promise
-    from harnack.fields.field import Field
     from harnack.geometry import Volume
 
 Fade: TypeAlias = Literal["quintic", "cubic"]
@@ -223,35 +229,6 @@ class FractalNoise(FormulaSolid):
         """A bound of the second derivative of f along any line."""
         return self._sum(2.0) * CONSTANTS[self.fade].max_second_derivative
 
-    def prepare(self, backend: Backend) -> Field:
-        """The same noise with its numbers and bounds as kernel parameters of the backend (numbers
-        that a compiled kernel reads when it runs)."""
-        prepared = with_device_numbers(self, backend)
-        # `_sum(1.0)` adds up what the octaves multiply a first derivative of the noise by.
-        constants = (self._sum(1.0) * CONSTANTS[self.fade].max_gradient, self.max_second_derivative)
-        # `_constants`: bounds of first and second derivatives. `_falls`: the ratio of an octave's
-        # amplitude to the one before.
-        numbers = {
-            "_constants": tuple(dr.opaque(backend.Float, constant) for constant in constants),
-            "_falls": dr.opaque(backend.Float, 2.0**-self.beta),
-            "_seed": dr.opaque(backend.UInt32, self.seed),
-        }
-        for name, value in numbers.items():
-            object.__setattr__(prepared, name, value)
-        return prepared
-
-    def promises(self, p: Vec3) -> tuple[Promise, ...]:
-        first, second = self._data(p.x)["_constants"]
-        return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
-
-    def _data(self, like: Real) -> dict[str, Any]:
-        """The attributes of the noise by name, with its numbers as kernel parameters of a backend.
-
-        like: any number of that backend.
-        """
-        prepared = self if hasattr(self, "_falls") else self.prepare(backend_of(like))
-        return vars(prepared)
-
     @property
     def may_jump(self) -> bool:
         """Whether f may jump: False, as noise is continuous."""
@@ -261,10 +238,63 @@ class FractalNoise(FormulaSolid):
         del level, above
         return None
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        numbers = with_device_numbers(self, backend)
+        bounds = tuple(
+            dr.opaque(backend.Float, bound)
+            # `_sum(1.0)` adds up what the octaves multiply a first derivative of the noise by.
+            for bound in (
+                self._sum(1.0) * CONSTANTS[self.fade].max_gradient,
+                self.max_second_derivative,
+            )
+        )
+        formula = _NoiseFormula(
+            numbers.frequency,
+            numbers.amplitude,
+            dr.opaque(backend.Float, 2.0**-self.beta),
+            dr.opaque(backend.UInt32, self.seed),
+            self.octaves,
+            self.fade,
+            type(self).__name__,
+        )
+        return _NoiseEvaluator(self, formula, numbers.lipschitz, bounds)
+
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        return self.evaluator(backend).formula
+
     def formula(self, x: Any, y: Any, z: Any) -> Any:
+        numbers = (
+            axis.backend_number() if is_jet(axis, type(self).__name__) else axis
+            for axis in (x, y, z)
+        )
+        like = next((number for number in numbers if dr.is_array_v(type(number))), x)
+        return self.formula_on(backend_of(like))(x, y, z)
+
+
+@dataclass(frozen=True, eq=False)
+class _NoiseFormula:
+    """The function of `FractalNoise`, with its numbers as kernel parameters of a backend.
+
+    frequency, amplitude: of the first octave.
+    fall: the ratio of an octave's amplitude to the one before.
+    seed: a Dr.Jit UInt32.
+    octaves, fade: as of `FractalNoise`.
+    name: the name of the field's class, for messages.
+    """
+
+    frequency: Real
+    amplitude: Real
+    fall: Real
+    seed: Any
+    octaves: int
+    fade: Fade
+    name: str
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives). Coordinates of a jet that are plain numbers are turned into constant jets."""
-        jets = [axis for axis in (x, y, z) if is_jet(axis, type(self).__name__)]
+        jets = [axis for axis in (x, y, z) if is_jet(axis, self.name)]
         if jets:
             coordinates = [
                 axis if isinstance(axis, Jet) else jets[0].coerce(axis) for axis in (x, y, z)
@@ -281,8 +311,7 @@ class FractalNoise(FormulaSolid):
         each: if True, the list has one tuple for each octave; else a single tuple, the sum of all
             octaves.
         """
-        data = self._data(q[0])
-        scale, amplitude = data["frequency"], data["amplitude"]
+        scale, amplitude = self.frequency, self.amplitude
         octaves: list[tuple[Any, list[Any], list[Any]]] = []
         for octave in range(self.octaves):
             position = [entry * scale for entry in q]
@@ -293,7 +322,7 @@ class FractalNoise(FormulaSolid):
             unsigned = dr.uint32_array_t(cast("Any", type(q[0])))
             # Negative indices become large unsigned ones, for which the hash function is as good.
             cell_index = [unsigned(integer(entry)) for entry in floors]
-            seed = data["_seed"] + octave
+            seed = self.seed + octave
             vectors: list[Any] = []
             for corner in CORNERS:
                 i, j, k = (b + c for b, c in zip(cell_index, corner, strict=True))
@@ -308,7 +337,7 @@ class FractalNoise(FormulaSolid):
                     [slope * scale * entry for entry in hessian],
                 )
             )
-            amplitude, scale = amplitude * data["_falls"], 2 * scale
+            amplitude, scale = amplitude * self.fall, 2 * scale
         if each:
             return octaves
         total = octaves[0]
@@ -336,9 +365,9 @@ class FractalNoise(FormulaSolid):
         ]
         center = [0 * like + start.value_on_backend(like).midpoint for start in starts]
         radii = [0 * like + start.value_on_backend(like).radius for start in starts]
-        data, constants = self._data(center[0]), CONSTANTS[self.fade]
+        constants = CONSTANTS[self.fade]
         epsilon = 2 * float(dr.epsilon(cast("Any", type(center[0]))))  # the machine epsilon
-        scale, amplitude = data["frequency"], data["amplitude"]
+        scale, amplitude = self.frequency, self.amplitude
         total: Jet | None = None
         for value, gradient, hessian in self._octaves(center, each=True):
             # The rounding errors of the octave. There are about thirty operations for each corner.
@@ -361,8 +390,22 @@ class FractalNoise(FormulaSolid):
             )
             jet = octave.jet(coordinates, starts, _norm3(radii))
             total = jet if total is None else total + jet
-            amplitude, scale = amplitude * data["_falls"], 2 * scale
+            amplitude, scale = amplitude * self.fall, 2 * scale
         return cast("Jet", total)
+
+
+@dataclass(frozen=True, eq=False)
+class _NoiseEvaluator(FormulaEvaluator):
+    """The evaluator of `FractalNoise`.
+
+    bounds: bounds of first and second derivatives of f, kernel parameters.
+    """
+
+    bounds: tuple[Real, ...]
+
+    def promises(self, p: Vec3) -> tuple[Promise, ...]:
+        first, second = self.bounds
+        return Lipschitz(0 * p.x + first), TaylorRemainder(0 * p.x + second)
 
 
 class Noise(FractalNoise):
@@ -433,6 +476,28 @@ class DisplacedSolid(FormulaSolid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.solid.formula(x, y, z) + self.noise.formula(x, y, z)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        solid, noise = self.solid.evaluator(backend), self.noise.evaluator(backend)
+        # The sum of the constants, as numbers of the backend.
+        first, second = solid.lipschitz, noise.lipschitz
+        lipschitz = None if first is None or second is None else first + second
+        return FormulaEvaluator(self, _SumOfFormulas(solid.formula, noise.formula), lipschitz)
+
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        return _SumOfFormulas(self.solid.formula_on(backend), self.noise.formula_on(backend))
+
+
+@dataclass(frozen=True, eq=False)
+class _SumOfFormulas:
+    """The sum of two functions of the coordinates."""
+
+    first: FormulaFunction
+    second: FormulaFunction
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+        return self.first(x, y, z) + self.second(x, y, z)
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,18 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.formula import Formula, is_jet, prepare_value
+from harnack.fields.formula import Formula, is_jet, on_backend
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
-from harnack.fields.solids.solid import Solid, SolidOfField
+from harnack.fields.solids.solid import (
+    EvaluatorOfInner,
+    Solid,
+    SolidOfField,
+    formula_of,
+    without_levels,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -72,7 +79,7 @@ def solid(
     if len(bounds) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
-    if field.jumps is not None:
+    if field.has_jumps:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
@@ -141,21 +148,47 @@ class SublevelSolid(SolidOfField):
 
         return bounded_side_extent(self.field, (level,), is_inside)
 
-    def evaluate(self, p: Vec3) -> Sample:
-        return self.field.evaluate(p)
-
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self.field.hessian(p)
-
-    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        return self.field.sample_ray(path, t, ahead, back)
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SublevelSolidEvaluator:
+        inner = self.field.evaluator(backend, plan)
+        return _SublevelSolidEvaluator(
+            inner, type(self.field).__name__, isinstance(self.field, Formula)
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if isinstance(self.field, Formula):
             return self.field.formula(x, y, z)
-        if not is_jet(x, type(self.field).__name__):
+        number = x.backend_number() if is_jet(x, type(self.field).__name__) else x
+        return self.evaluator(backend_of(number)).formula(x, y, z)
+
+
+@dataclass(frozen=True, eq=False)
+class _SublevelSolidEvaluator(EvaluatorOfInner):
+    """The evaluator of a `SublevelSolid`, whose function is that of the field.
+
+    field_name: the name of the field's class, for messages.
+    has_formula: whether the field is a `Formula`.
+    """
+
+    field_name: str
+    has_formula: bool
+
+    def evaluate(self, p: Vec3) -> Sample:
+        return self.inner.evaluate(p)
+
+    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
+        return self.inner.hessian(p)
+
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        return self.inner.sample_ray(path, t, ahead, back)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at coordinates that are Dr.Jit numbers or jets; of a `Formula`, numbers of any
+        arithmetic."""
+        if self.has_formula:
+            return formula_of(self.inner)(x, y, z)
+        if not is_jet(x, self.field_name):
             return self.differentiable_value(_vector(x, y, z))
-        return field_jet(self.field, x, y, z)
+        return field_jet(self.inner, x, y, z, self.field_name)
 
 
 def bounded_side_extent(
@@ -195,12 +228,14 @@ def _vector(x: Real, y: Real, z: Real) -> Vec3:
     return backend_of(x).Array3f(x, y, z)
 
 
-def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
+def field_jet(evaluator: Evaluator, x: Jet, y: Jet, z: Jet, name: str) -> Jet:
     """The jet of a field f (proved ranges of its value and derivatives), from the jets of the
     coordinates. It lets a field without a formula be used in formulas of solids. The field's
     samples must promise a bound of second derivatives near the point.
 
+    evaluator: the evaluator of the field.
     x, y, z: the jets of the coordinates, at a point or on a piece of a line.
+    name: the name of the field's class, for a message.
 
     Proof. Let q be the point, or the start of the piece, and |f''| <= H within the distance r of q.
     Let all points of the piece be within m of q, rounding included. If m <= r, the gradient on the
@@ -221,15 +256,15 @@ def field_jet(field: Field, x: Jet, y: Jet, z: Jet) -> Jet:
     # start, which is known up to rounding. (0 times a number of the backend gives arrays, not
     # Python numbers.)
     q = _vector(*(0 * x.piece_length + entry.value.midpoint for entry in starts))
-    sample = field.evaluate(q)
-    bound, radius = _second_derivative_bound(field, sample)
+    sample = evaluator.evaluate(q)
+    bound, radius = _second_derivative_bound(sample, name)
     offset = safe_norm(type(q)(*(0 * x.piece_length + entry.value.radius for entry in starts)))
-    rows = _hessian_rows(field, q) if len(x.second_derivatives) == _PAIR_COUNT else None
+    rows = _hessian_rows(evaluator, q) if len(x.second_derivatives) == _PAIR_COUNT else None
     second_error = 2 * bound
     if rows is not None:
         is_point = offset <= _MAX_POINT_ROUNDINGS * float(dr.epsilon(type(q.x))) * max_norm(q)
         second_error = dr.select(
-            is_point, fmin(second_error, field.derivative_errors(q, sample)[1]), second_error
+            is_point, fmin(second_error, evaluator.derivative_errors(q, sample)[1]), second_error
         )
 
     def derivative_ranges(
@@ -325,20 +360,22 @@ def _variable_pairs(n: int, count: int) -> list[tuple[int, int]]:
 _PAIR_COUNT, _MAX_POINT_ROUNDINGS = 6, 256.0
 
 
-def _hessian_rows(field: Field, q: Vec3) -> list[list[Interval]] | None:
+def _hessian_rows(evaluator: Evaluator, q: Vec3) -> list[list[Interval]] | None:
     """The rows of the Hessian of a field at a point q, with each entry as an interval of a single
     number; None for a field without a Hessian."""
     try:
-        rows = field.hessian(q)
+        rows = evaluator.hessian(q)
     except NotImplementedError:
         return None
     return [[Interval.point(number) for number in row] for row in rows]
 
 
-def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
+def _second_derivative_bound(sample: Sample, name: str) -> tuple[Real, Real]:
     """A bound of the second derivatives of a field along all lines, on a ball about the point of a
     sample, and the radius of that ball. It follows from the first of the sample's promises (proved
     bounds of f near the point) that implies one.
+
+    name: the name of the field's class, for the message.
 
     Raises:
         TypeError: no promise implies such a bound.
@@ -348,7 +385,7 @@ def _second_derivative_bound(field: Field, sample: Sample) -> tuple[Real, Real]:
         if bound is not None:
             return bound
     raise TypeError(
-        f"{type(field).__name__} promises neither a HarmonicBall with both ends nor a Curvature "
+        f"{name} promises neither a HarmonicBall with both ends nor a Curvature "
         "without a radius, and has no formula, so it cannot be blended, twisted or tapered; "
         "move it by moved, rotated, scaled or transformed, and join it by |, & and -"
     )
@@ -386,11 +423,15 @@ class BandSolid(SolidOfField):
         domain = None if self.field.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
 
-    def prepare(self, backend: Backend) -> Solid:
-        prepared = super().prepare(backend)
-        for name in ("level", "half_width"):
-            object.__setattr__(prepared, name, prepare_value(getattr(self, name), backend))
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        inner = self.field.evaluator(backend, without_levels(plan))
+        level, half_width = on_backend((self.level, self.half_width), backend)
+        return _BandSolidEvaluator(inner, level, half_width, self.field.period)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        if not isinstance(self.field, Formula | Solid):
+            return super().formula(x, y, z)
+        return abs(self.field.formula(x, y, z) - self.level) - self.half_width
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where the solid's function, |f -
@@ -416,12 +457,25 @@ class BandSolid(SolidOfField):
 
         return bounded_side_extent(self.field, ends, is_inside)
 
+
+@dataclass(frozen=True, eq=False)
+class _BandSolidEvaluator(EvaluatorOfInner):
+    """The evaluator of a `BandSolid`, from that of f.
+
+    level, half_width: kernel parameters.
+    period: the period of f; None if f is real-valued.
+    """
+
+    level: Real
+    half_width: Real
+    period: float | None
+
     def evaluate(self, p: Vec3) -> Sample:
-        return self._sample_with_difference(self.field.evaluate(p))[0]
+        return self._sample_with_difference(self.inner.evaluate(p))[0]
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        is_below = self._level_difference(self.field.evaluate(p).value) < 0
-        x, y, z = (dr.select(is_below, -row, row) for row in self.field.hessian(p))
+        is_below = self._level_difference(self.inner.evaluate(p).value) < 0
+        x, y, z = (dr.select(is_below, -row, row) for row in self.inner.hessian(p))
         return x, y, z
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
@@ -432,14 +486,14 @@ class BandSolid(SolidOfField):
 
         sample: the sample of the solid at p; not used.
         """
-        inner_sample = self.field.evaluate(p)
-        first_error, second_error = self.field.derivative_errors(p, inner_sample)
+        inner_sample = self.inner.evaluate(p)
+        first_error, second_error = self.inner.derivative_errors(p, inner_sample)
         error = value_error_bound(inner_sample, safe_norm(inner_sample.gradient), max_norm(p))
         # The difference between f and the nearest value at which derivatives jump: the level or,
         # for an angle-valued f, also the value half a period away from it.
         kink_distance = dr.abs(self._level_difference(inner_sample.value))
-        if self.field.period is not None:
-            kink_distance = fmin(kink_distance, 0.5 * self.field.period - kink_distance)
+        if self.period is not None:
+            kink_distance = fmin(kink_distance, 0.5 * self.period - kink_distance)
         is_clear = kink_distance > error
         return dr.select(is_clear, first_error, dr.inf), dr.select(is_clear, second_error, dr.inf)
 
@@ -451,13 +505,13 @@ class BandSolid(SolidOfField):
         path: the ray.
         ahead, back: the lengths in front of and behind the point up to which enclosures are useful.
         """
-        ray_sample = self.field.sample_ray(path, t, ahead, back)
+        ray_sample = self.inner.sample_ray(path, t, ahead, back)
         sample, offset = self._sample_with_difference(ray_sample.sample)
 
         def folded(enclosures: tuple[Enclosure, ...]) -> tuple[Enclosure, ...]:
             """The enclosures of |f - level|, from the given enclosures of f: one for each."""
             return tuple(
-                FoldedEnclosure(enclosure, offset, self.field.period) for enclosure in enclosures
+                FoldedEnclosure(enclosure, offset, self.period) for enclosure in enclosures
             )
 
         # The absolute value reverses the slope where f is below the level.
@@ -468,9 +522,9 @@ class BandSolid(SolidOfField):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if not isinstance(self.field, Formula | Solid):
-            return super().formula(x, y, z)
-        return abs(self.field.formula(x, y, z) - self.level) - self.half_width
+        """The function of the solid at coordinates that are numbers of any arithmetic. Raises
+        TypeError if the field has no formula."""
+        return abs(formula_of(self.inner)(x, y, z) - self.level) - self.half_width
 
     def _level_difference(self, value: Real) -> Real:
         """f - level. If f is angle-valued, the multiple of its period that is nearest is
@@ -478,7 +532,7 @@ class BandSolid(SolidOfField):
 
         value: f.
         """
-        offset, period = value - self.level, self.field.period
+        offset, period = value - self.level, self.period
         return offset if period is None else offset - period * dr.round(offset / period)
 
     def _sample_with_difference(self, sample: Sample) -> tuple[Sample, Real]:

@@ -7,7 +7,6 @@ point of the set."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.validation import as_finite, as_integer_in_range
 from harnack.enclosures import Lipschitz
 from harnack.enclosures.samples import Sample
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.solids.solid import Solid, ball_around
 
 if TYPE_CHECKING:
@@ -111,20 +111,6 @@ class Julia(Solid):
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
-    def prepare(self, backend: Backend) -> Julia:
-        """The same set with its numbers as kernel parameters of the backend (numbers that a
-        compiled kernel reads when it runs): c, the fourth coordinate, |c| and B."""
-        prepared = copy.copy(self)
-        size = math.hypot(*self.c)
-        for name, value in (
-            ("_c", self.c),
-            ("_slice", self.fourth_coordinate),
-            ("_size", size),
-            ("_b", self.escape_radius),
-        ):
-            object.__setattr__(prepared, name, _kernel_parameters(backend, value))
-        return prepared
-
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A ball about the origin that contains all points where f <= level. None if `above`, as
         the points where f >= level are unbounded; and for a level so large that the ball's radius
@@ -144,14 +130,35 @@ class Julia(Solid):
         square = reach * reach - self.fourth_coordinate * self.fourth_coordinate
         return ball_around((0.0, 0.0, 0.0), math.sqrt(max(square, 0.0)))
 
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of the set, with c, the fourth coordinate, |c| and B as kernel parameters
+        of the backend (numbers that a compiled kernel reads when it runs)."""
+        del plan
+        numbers = self.c, self.fourth_coordinate, math.hypot(*self.c), self.escape_radius
+        return _JuliaEvaluator(*_kernel_parameters(backend, numbers), self.iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class _JuliaEvaluator(Evaluator):
+    """The evaluator of a `Julia` set.
+
+    c: the four parts of the constant.
+    fourth_coordinate: the position of the slice.
+    size: |c|.
+    escape_radius: B.
+    iterations: N.
+    """
+
+    c: tuple[Real, Real, Real, Real]
+    fourth_coordinate: Real
+    size: Real
+    escape_radius: Real
+    iterations: int
+
     def evaluate(self, p: Vec3) -> Sample:
         """The sample of f at p. A first orbit gives f and its gradient, and so the longest step
         that could be proved. A second computation gives Lipschitz constants on balls about p, whose
         radii are fractions of that step. Where none is proved, the radius is 0."""
-        if not hasattr(self, "_c"):
-            from harnack.backend import backend_of
-
-            return self.prepare(backend_of(p)).evaluate(p)
         zero = 0 * p.x
         # With the radius 0 alone; `steepest` is then a bound of |grad f| at p itself.
         value, gradient, error, (steepest,) = self._orbit(p, (zero,))
@@ -159,7 +166,7 @@ class Julia(Solid):
         # center.
         longest = dr.abs(value) / steepest
         # Where |f|/|grad f| tells nothing, any length may be tried.
-        longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self._parameter("_b"))
+        longest = clamp(dr.select(dr.isfinite(longest), longest, 1), 1e-6, self.escape_radius)
         radii = tuple(longest * fraction for fraction in _RADIUS_FRACTIONS)
         constants = self._orbit(p, radii)[3]  # the bounds of |grad f|
         promises: list[Lipschitz] = []
@@ -170,31 +177,27 @@ class Julia(Solid):
             )
         return Sample(value, gradient, tuple(promises), error)
 
-    def _parameter(self, name: str) -> Any:
-        """The attribute `name` of the prepared solid, a number (or a tuple) on the backend."""
-        return getattr(self, name)
-
     def _orbit(self, p: Vec3, radii: tuple[Real, ...]) -> tuple[Any, ...]:
         """Compute the orbit of p. Returns four results: f at p; its gradient; a bound of the error
         of f; and for each radius a bound of |grad f| on the ball of that radius about p.
 
         radii: of the balls. The first must be 0: it gives the rounding error of f.
 
-        The class docstring has the formulas, for all orbits that begin in the ball about p. In the
-        code `size` is |c|, and b is B. For each radius, `change` holds e_n, a bound of how far the
-        n-th iterates of these orbits are from q_n; `slopes` holds d_n, a bound of the derivatives
-        of these iterates by the starting point; `min_q` holds m_n, a lower bound of their absolute
-        values; and `rates` holds g_n, a bound of the derivatives of the logarithms of these. `jac`
-        is the Jacobian of q_n with respect to x, y and z. `rounded` is the bound of the rounding of
-        one iteration.
+        The docstring of `Julia` has the formulas, for all orbits that begin in the ball about p. In
+        the code `size` is |c|, and b is B. For each radius, `change` holds e_n, a bound of how far
+        the n-th iterates of these orbits are from q_n; `slopes` holds d_n, a bound of the
+        derivatives of these iterates by the starting point; `min_q` holds m_n, a lower bound of
+        their absolute values; and `rates` holds g_n, a bound of the derivatives of the logarithms
+        of these. `jac` is the Jacobian of q_n with respect to x, y and z. `rounded` is the bound of
+        the rounding of one iteration.
         """
-        c, size, b = self._parameter("_c"), self._parameter("_size"), self._parameter("_b")
+        c, size, b = self.c, self.size, self.escape_radius
         real = cast("Any", type(p.x))
         is_single = dr.type_v(real) == dr.VarType.Float32
         escape = _ESCAPED_NORM["single" if is_single else "double"]
         epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         zero, ones = 0 * p.x, 0 * p.x + 1
-        q = [p.x, p.y, p.z, zero + self._parameter("_slice")]
+        q = [p.x, p.y, p.z, zero + self.fourth_coordinate]
         jac = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]
         change = [zero + r for r in radii]
         slopes = [ones for _ in radii]

@@ -13,7 +13,6 @@ same bits. It takes a thirtieth of the time of the search for the nearest triang
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -34,7 +33,8 @@ from harnack.backend.validation import format_vector
 from harnack.enclosures import Lipschitz
 from harnack.enclosures.samples import Ray as Ray
 from harnack.enclosures.samples import RaySample, Sample
-from harnack.fields.batched_fields import cached_prepare
+from harnack.fields.batched_fields import cached_upload
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.formula import is_jet
 from harnack.fields.solids.solid import Solid, box_around, set_frozen
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES, LoadedMesh, read_geometry
@@ -205,17 +205,37 @@ class MeshSolid(Solid):
         x, y, z = (float(coordinate) for coordinate in half)
         return box_around((x, y, z), tuple(float(coordinate) for coordinate in center))
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> MeshSolid:
-        prepared = copy.copy(self)
-        set_frozen(prepared, "_on_device", _MeshData.upload(backend, self.surface))
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _MeshSolidEvaluator:
+        del plan
+        return _MeshSolidEvaluator(self._upload(backend))
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> _MeshData:
+        """Upload the triangles of the surface to a backend."""
+        return _MeshData.upload(backend, self.surface)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        like = x.piece_length if is_jet(x, type(self).__name__) else x
+        return self.formula_on(backend_of(like))(x, y, z)
+
+    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
+        return self.evaluator(backend).formula
+
+
+@dataclass(frozen=True, eq=False)
+class _MeshSolidEvaluator(Evaluator):
+    """The evaluator of a `MeshSolid`.
+
+    data: the triangles on a backend.
+    """
+
+    data: _MeshData
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample of f at p: value, gradient, error bounds and the Lipschitz constant 1. Within
         the context `share_samples`, a sample at the same Dr.Jit points is computed once and then
         taken from a cache."""
-        data, cache = _data_on_backend(self, p), _SAMPLE_CACHE.get()
+        data, cache = self.data, _SAMPLE_CACHE.get()
         if cache is None or dr.flag(dr.JitFlag.SymbolicScope):
             return data.sample(p)
         # Dr.Jit numbers its arrays: points with the same three indices are the same arrays.
@@ -245,9 +265,11 @@ class MeshSolid(Solid):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if not is_jet(x, type(self).__name__):
+        """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
+        derivatives)."""
+        if not is_jet(x, self.name):
             return self.differentiable_value(backend_of(x).Array3f(x, y, z))
-        return mesh_distance_jet(self, x, y, z)
+        return mesh_distance_jet(self.data, x, y, z)
 
 
 _SAMPLE_CACHE: ContextVar[dict[tuple[int, ...], tuple[Vec3, Sample]] | None] = ContextVar(
@@ -269,16 +291,6 @@ def share_samples() -> Generator[None]:
         yield
     finally:
         _SAMPLE_CACHE.reset(token)
-
-
-def _data_on_backend(solid: Any, like: Any) -> _MeshData:
-    """The triangles of a solid on a backend; they are uploaded if the solid is not prepared.
-
-    like: a number or a point of the backend.
-    """
-    if not hasattr(solid, "_on_device"):
-        solid = solid.prepare(backend_of(like))
-    return solid._on_device
 
 
 @dataclass(frozen=True)
@@ -446,11 +458,11 @@ def _triangle_tree(
     return TriangleTree.of(backend, tree, records, slabs=slabs)
 
 
-def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
+def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
     """The jet (proved ranges of value and derivatives) of the signed distance d from a mesh, from
     the jets of the coordinates.
 
-    solid: the solid of the mesh.
+    data: the triangles of the mesh on a backend.
     x, y, z: the jets of the coordinates, at a point or on a piece of a line.
 
     Proof. d has the Lipschitz constant 1. So its derivative by any variable is at most the length
@@ -465,7 +477,7 @@ def mesh_distance_jet(solid: MeshSolid, x: Jet, y: Jet, z: Jet) -> Jet:
     starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
     zero = 0 * x.piece_length
     q = backend_of(zero).Array3f(*(zero + coord.value.midpoint for coord in starts))
-    sample, edge, on_edge, at_vertex = _data_on_backend(solid, q).sample_with_feature(q)
+    sample, edge, on_edge, at_vertex = data.sample_with_feature(q)
     input_error = sum((coord.value.radius for coord in starts), zero)
     error = sample.value_error + input_error
     # True where the coordinates are ranges, and not numbers with their rounding: at other points of

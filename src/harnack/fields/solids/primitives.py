@@ -14,12 +14,9 @@ from typing import TYPE_CHECKING, Any
 from harnack.arithmetic import cos, maximum, minimum, norm, sin
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend.validation import as_finite, as_positive, as_triple
-from harnack.fields.formula import with_device_numbers
 from harnack.fields.solids.solid import FormulaSolid, Point, ball_around, box_around, set_frozen
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend
-    from harnack.fields.field import Field
     from harnack.geometry import Volume
 
 
@@ -382,12 +379,9 @@ class _Powered(FormulaSolid):
     """A solid whose formula has powers p and q, the exponents of norms. In a kernel they are
     literals, not parameters, so that other powers compile another kernel."""
 
-    powers: tuple[float, float]
+    literals = ("powers",)
 
-    def prepare(self, backend: Backend) -> Field:
-        prepared = with_device_numbers(self, backend)
-        set_frozen(prepared, "powers", self.powers)
-        return prepared
+    powers: tuple[float, float]
 
 
 @dataclass(frozen=True)

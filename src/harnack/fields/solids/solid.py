@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import abc
 import copy
-import dataclasses
-import functools
 import math
-from typing import TYPE_CHECKING, Any, cast
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from harnack.backend.validation import as_positive, no_derivatives
-from harnack.cluster.serialization import TransientCache
 from harnack.fields.capabilities import VariableAccuracy
+from harnack.fields.evaluator import Evaluator, Plan
 from harnack.fields.field import Field
-from harnack.fields.formula import Formula
+from harnack.fields.formula import Formula, FormulaFunction
 from harnack.geometry import Ball, Box, Volume
 
 if TYPE_CHECKING:
@@ -100,23 +99,6 @@ def not_a_solid(other: Any) -> str:
     return f"only solids, such as harnack.Sphere(1.0), are combined, not {kind}"
 
 
-def _with_source(prepare: Callable[[Any, Backend], Field]) -> Callable[[Any, Backend], Field]:
-    """Decorator of the method `prepare` of a solid. The prepared solid, whose numbers lie on a
-    backend, keeps a reference to the original in its attribute `_source`. The original has Python
-    numbers, from which `Solid.extent` is computed."""
-
-    @functools.wraps(prepare)
-    def remembering(self: Any, backend: Backend) -> Field:
-        """The prepared solid, with the original in its attribute `_source`."""
-        prepared = prepare(self, backend)
-        if prepared is not self:
-            # If `self` is already prepared, its own original is passed on.
-            object.__setattr__(prepared, "_source", vars(self).get("_source", self))
-        return prepared
-
-    return remembering
-
-
 class Solid(Field):
     """A solid: the points where its function f is at most 0. Its surface is the level set f = 0. A
     solid is also a field, so samples of f give its value and gradient at a point, with proved
@@ -148,19 +130,8 @@ class Solid(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of f at these levels; None if none is
         known. It is a volume that contains all points with f at most the highest level; if none is
-        known, one that contains all points with f at least the lowest level. For a prepared solid
-        it is computed from the original, which has Python numbers."""
-        original: Solid = vars(self).get("_source", self)
-        return original.sublevel_extent(max(levels)) or original.sublevel_extent(
-            min(levels), above=True
-        )
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Wrap the method `prepare` of a new subclass, so that a prepared solid keeps a reference
-        to the original."""
-        super().__init_subclass__(**kwargs)
-        if "prepare" in vars(cls):
-            cls.prepare = _with_source(cls.prepare)  # type: ignore[method-assign]
+        known, one that contains all points with f at least the lowest level."""
+        return self.sublevel_extent(max(levels)) or self.sublevel_extent(min(levels), above=True)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
@@ -174,6 +145,11 @@ class Solid(Field):
             f"{type(self).__name__} has no formula, so it cannot be blended, twisted or tapered; "
             "move it by moved, rotated, scaled or transformed, and join it by |, & and -"
         )
+
+    def formula_on(self, backend: Backend) -> FormulaFunction:
+        """The formula with its data on a backend. By default it is that of the evaluator."""
+        evaluator: Any = self.evaluator(backend)
+        return getattr(evaluator, "formula", self.formula)
 
     @abc.abstractmethod
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
@@ -278,30 +254,6 @@ class Solid(Field):
 
         return self._apply_map(AffineMap.rotation(degrees, axis))
 
-    @functools.cached_property
-    def _ray_count_variants(self) -> TransientCache[tuple[int, ...], Solid]:
-        """A cache of the combinations that `_for_rays` has made so far. The key of a combination is
-        the tuple of the identities (`id`) of its parts."""
-        return TransientCache()
-
-    def _for_rays(
-        self, parts: Sequence[Field], count: int, make: Callable[[list[Field]], Solid]
-    ) -> Field:
-        """The field to use in place of this solid when `count` rays are traced: the same
-        combination with each part replaced by part.for_ray_count(count) (`Field.for_ray_count`). If
-        no part changes, it is this solid itself. Combinations are cached, so that nothing is
-        prepared twice.
-
-        parts: the parts of this solid.
-        make: a function that makes the combination from a list of parts.
-        """
-        variants = [part.for_ray_count(count) for part in parts]
-        # Fields are compared by identity: each part is an object that the solid keeps alive.
-        key = tuple(map(id, variants))
-        if key == tuple(map(id, parts)):
-            return self
-        return self._ray_count_variants.get_or_make(key, lambda: make(variants))
-
     @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
         """The solid, scaled about the origin.
@@ -383,46 +335,67 @@ class SolidOfField(Solid):
         inner = self.field.operands()
         return tuple(map(self._with_inner, inner)) if len(inner) > 1 else (self,)
 
-    @property
-    def is_steep(self) -> bool:
-        return self.field.is_steep
-
-    def prepare(self, backend: Backend) -> Solid:
-        return self._with_inner(self.field.prepare(backend))
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        inner: VariableAccuracy | None = self.field.variable_accuracy
-        if inner is None:
-            return None
-        return VariableAccuracy(lambda scale: self._with_inner(inner.at(scale)), inner.coarsest)
-
     def _with_inner(self, inner: Field) -> Solid:
-        """The same solid made of another inner field, such as one that is prepared."""
+        """The same solid made of another inner field."""
         solid = copy.copy(self)
         object.__setattr__(solid, "field", inner)
         return solid
 
-    def for_ray_count(self, count: int) -> Field:
-        def make(parts: list[Field]) -> Solid:
-            """The same solid made of the inner field parts[0]."""
-            return dataclasses.replace(cast("Any", self), field=parts[0])
+    @property
+    def has_variable_accuracy(self) -> bool:
+        return self.field.has_variable_accuracy
 
-        return self._for_rays([self.field], count, make)
+
+@dataclass(frozen=True, eq=False)
+class EvaluatorOfInner(Evaluator):
+    """The evaluator of a solid whose function is made from the function of another field, the inner
+    field. Its derivatives are those of the inner field, up to their sign.
+
+    inner: the evaluator of the inner field.
+    """
+
+    inner: Evaluator
+
+    @property
+    def is_steep(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.inner.is_steep
+
+    @property
+    def variable_accuracy(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> VariableAccuracy | None:
+        inner = self.inner.variable_accuracy
+        if inner is None:
+            return None
+        return VariableAccuracy(lambda scale: replace(self, inner=inner.at(scale)), inner.coarsest)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at p, of the gradient and of the Hessian: those of the inner field,
         whose derivatives are the same up to their sign."""
         del sample
-        return self.field.derivative_errors(p, self.field.evaluate(p))
+        return self.inner.derivative_errors(p, self.inner.evaluate(p))
+
+
+def without_levels(plan: Plan) -> Plan:
+    """The plan for a field whose levels are others than those of the solid that is made of it."""
+    return Plan(ray_count=plan.ray_count)
+
+
+def formula_of(evaluator: Evaluator) -> FormulaFunction:
+    """The formula of an evaluator.
+
+    Raises:
+        TypeError: it has none.
+    """
+    formula: FormulaFunction | None = getattr(evaluator, "formula", None)
+    if formula is None:
+        raise TypeError(f"{evaluator.name} has no formula")
+    return formula
 
 
 class FormulaSolid(Formula, Solid):
     """A solid whose function f is a formula of the coordinates, its method `formula`. Value,
     gradient and proofs follow from the formula."""
-
-    def prepare(self, backend: Backend) -> Field:
-        return super().prepare(backend)
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)

@@ -29,7 +29,7 @@ from harnack.backend.validation import (
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.formula import with_device_numbers
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.solids.extrusions import SolidOfRevolution
 from harnack.fields.solids.solid import Solid, set_frozen
 from harnack.name_suggestions import did_you_mean
@@ -138,44 +138,70 @@ class Thread(Solid):
         del level, above
         return None
 
-    def prepare(self, backend: Backend) -> Thread:
-        """The same thread with its numbers as kernel parameters of the backend (numbers that a
-        compiled kernel reads when it runs)."""
-        prepared = with_device_numbers(self, backend)
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator of the thread, with its numbers as kernel parameters of the backend
+        (numbers that a compiled kernel reads when it runs)."""
+        del plan
         numbers: Any = cast("Any", self)
-        points = tuple(
-            tuple(dr.opaque(backend.Float, number) for number in row) for row in numbers._points
-        )
-        set_frozen(prepared, "_points", points)
-        for name in ("_lead", "_least", "_most", "_size", "lipschitz"):
-            set_frozen(prepared, name, dr.opaque(backend.Float, getattr(self, name)))
-        return prepared
+
+        def parameter(number: float) -> Real:
+            """A number as a kernel parameter."""
+            return dr.opaque(backend.Float, number)
+
+        points = tuple((parameter(z), parameter(r)) for z, r in numbers._points)
+        return _ThreadEvaluator(
+            parameter(self.pitch), points, parameter(numbers._lead), parameter(numbers._least),
+            parameter(numbers._most), parameter(numbers._size), parameter(self.lipschitz),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _ThreadEvaluator(Evaluator):
+    """The evaluator of a `Thread`. Its numbers are kernel parameters.
+
+    pitch: the period of the profile along the axis.
+    points: the vertices (z, r) of three periods of the profile, and the first one of the next
+        period.
+    lead: the distance by which the screw moves along the axis for each radian.
+    least: half of the smallest r of the profile. f is at least minus this number.
+    most: the largest r of the profile.
+    size: a bound of the numbers in the computation of distances.
+    lipschitz: the Lipschitz constant of f.
+    """
+
+    pitch: Real
+    points: tuple[tuple[Real, Real], ...]
+    lead: Real
+    least: Real
+    most: Real
+    size: Real
+    lipschitz: Real
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: the signed distance of (r, u) from the profile, where u is reduced to
         the period from 0 to the pitch. In the core, the points near the axis where f is at its
         lower limit, f is constant, and its gradient is 0."""
-        real, data = cast("Any", type(p.x)), cast("Any", self)
+        real = cast("Any", type(p.x))
         epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         r = dr.sqrt(dr.fma(p.x, p.x, p.y * p.y))
         # u, and then u in the period from 0 to the pitch.
-        axial = p.z - dr.atan2(p.y, p.x) * data._lead
+        axial = p.z - dr.atan2(p.y, p.x) * self.lead
         axial = axial - dr.floor(axial / self.pitch) * self.pitch
-        error = 8 * epsilon * (dr.abs(p.z) + r + data._size)
+        error = 8 * epsilon * (dr.abs(p.z) + r + self.size)
         is_outside = r >= self._profile_radius(axial)
         sign = dr.select(is_outside, real(1), real(-1))
         distance, d_r, d_z, gradient_error = self._distance_with_gradient(r, axial, sign, error)
         value = sign * distance
-        # f is at least -m/2, where m is the smallest radius of the profile; `_least` is m/2.
-        is_core = value <= -data._least
-        value = dr.select(is_core, -data._least, value)
+        # f is at least -m/2, where m is the smallest radius of the profile; `least` is m/2.
+        is_core = value <= -self.least
+        value = dr.select(is_core, -self.least, value)
         d_r, d_z = (dr.select(is_core, 0, derivative) for derivative in (d_r, d_z))
         # The unit vector away from the axis; 0 on the axis.
         divisor = dr.select(r > 0, r, 1)
         x, y = p.x / divisor, p.y / divisor
-        # u = z - _lead * angle, so the derivative of f along the tangent is that by u times
-        # -_lead/r. The radial, tangential and axial components are turned to x, y and z.
-        tangential = -d_z * data._lead / divisor
+        # u = z - lead * angle, so the derivative of f along the tangent is that by u times
+        # -lead/r. The radial, tangential and axial components are turned to x, y and z.
+        tangential = -d_z * self.lead / divisor
         gradient = cast("Any", type(p))(d_r * x - tangential * y, d_r * y + tangential * x, d_z)
         # A Dr.Jit array, with the number in each lane.
         constant = 0 * p.x + self.lipschitz
@@ -200,28 +226,22 @@ class Thread(Solid):
         # which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return ray_sample
-        numbers = cast("Any", self)
         # In this order: f, its error, r = |(x, y)|, half the derivative of r^2 along the ray, the
         # squared length of (d.x, d.y), the radius of the cylinder, the Lipschitz constant.
         cylinder = OutsideCylinderEnclosure(
             ray_sample.sample.value, ray_sample.sample.value_error,
             dr.sqrt(dr.fma(p.x, p.x, p.y * p.y)), dr.fma(p.x, d.x, p.y * d.y),
-            dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + numbers._most, 0 * p.x + self.lipschitz,
+            dr.fma(d.x, d.x, d.y * d.y), 0 * p.x + self.most, 0 * p.x + self.lipschitz,
         )  # fmt: skip
         return replace(ray_sample, forward=(*ray_sample.forward, cylinder))
 
     def _profile_radius(self, z: Real) -> Real:
         """The profile's r at the position z along the axis. z: from 0 to the pitch."""
         height = 0 * z
-        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
+        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self.points):
             r = start_r + (z - start_z) / (end_z - start_z) * (end_r - start_r)
             height = dr.select((z >= start_z) & (z <= end_z), r, height)
         return height
-
-    def _corners(self) -> tuple[tuple[Real, Real], ...]:
-        """The vertices (z, r) of three periods of the profile, and the first one of the next
-        period."""
-        return cast("Any", self)._points
 
     def _distance_with_gradient(
         self, r: Real, z: Real, sign: Real, error: Real
@@ -240,7 +260,7 @@ class Thread(Solid):
         zero = 0 * r
         nearest, d_r, d_z, gradient_error = zero + dr.inf, zero, zero, zero
         epsilon = 2 * float(dr.epsilon(cast("Any", type(r))))  # the machine epsilon
-        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self._corners()):
+        for (start_z, start_r), (end_z, end_r) in itertools.pairwise(self.points):
             edge_z, edge_r = zero + (end_z - start_z), zero + (end_r - start_r)
             inverse_length = dr.rsqrt(edge_z * edge_z + edge_r * edge_r)
             from_z, from_r = z - start_z, r - start_r

@@ -6,6 +6,7 @@ preimage of p, times a factor."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +22,29 @@ from harnack.backend.validation import check_no_derivatives
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.formula import as_jet, hessian_error, with_device_numbers
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.formula import (
+    FormulaEvaluator,
+    FormulaFunction,
+    as_jet,
+    hessian_error,
+    with_device_numbers,
+)
 from harnack.fields.parameters import Parametrized
-from harnack.fields.solids.solid import FormulaSolid, Solid, SolidOfField
+from harnack.fields.solids.solid import (
+    EvaluatorOfInner,
+    Solid,
+    SolidOfField,
+    SpaceMap,
+    axis_index,
+    formula_of,
+    without_levels,
+)
 from harnack.geometry import Ball, ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.geometry import Volume
-
-from harnack.fields.solids.solid import SpaceMap, axis_index
 
 
 @dataclass(frozen=True)
@@ -214,10 +228,13 @@ class TransformedSolid(SolidOfField):
     the inner solid is sampled. A length on the ray is |M^-1 d| times as large on that line
     (`ScaledEnclosure`). The coordinates on the line are rounded by a few units in the last place of
     the sum of the absolute values of their terms; this enters the error of the value.
+
+    inverse_map: the inverse of the map, in Python numbers.
     """
 
     field: Solid
     map: AffineMap
+    inverse_map: _InverseMap = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Set the attributes that follow from the inner solid and from the map: the domain, the
@@ -236,7 +253,7 @@ class TransformedSolid(SolidOfField):
             )
         object.__setattr__(self, "domain", domain)
         numbers = _InverseMap.of(self.map)
-        object.__setattr__(self, "_numbers", numbers)
+        object.__setattr__(self, "inverse_map", numbers)
         # Preimages are at most `stretch` times as far apart as the points, so slopes grow by that
         # factor.
         constant = self.field.lipschitz
@@ -247,32 +264,57 @@ class TransformedSolid(SolidOfField):
             self, "min_wavelength", None if wavelength is None else wavelength / numbers.stretch
         )
 
-    @property
-    def numbers(self) -> _InverseMap:
-        """The inverse map. Once the solid is prepared, its numbers are on the backend."""
-        return cast("Any", self)._numbers
-
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         inner_level = level / self.map.value_factor
         return self.map.volume(self.field.sublevel_extent(inner_level, above=above))
 
-    def prepare(self, backend: Backend) -> Solid:
-        prepared = super().prepare(backend)
-        object.__setattr__(prepared, "_numbers", self.numbers.prepare(backend))
-        return prepared
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        return _TransformedSolidEvaluator(
+            self.field.evaluator(backend, without_levels(plan)),
+            self.inverse_map.on_backend(backend),
+            is_similarity=self.map.similarity is not None,
+        )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.field.formula(*self.numbers.local(x, y, z)) * self.numbers.factor
+        return _formula_of_image(self.field.formula, self.inverse_map, x, y, z)
+
+
+def _formula_of_image(
+    formula: FormulaFunction, numbers: _InverseMap, x: Any, y: Any, z: Any
+) -> Any:
+    """The function of the image of a solid under an affine map.
+
+    formula: the function of the solid.
+    numbers: the inverse of the map.
+    x, y, z: the coordinates, numbers of any arithmetic.
+    """
+    return formula(*numbers.local(x, y, z)) * numbers.factor
+
+
+@dataclass(frozen=True, eq=False)
+class _TransformedSolidEvaluator(EvaluatorOfInner):
+    """The evaluator of a `TransformedSolid`, from that of the inner solid.
+
+    numbers: the inverse map, on the backend.
+    is_similarity: whether the map multiplies all lengths by the same factor.
+    """
+
+    numbers: _InverseMap
+    is_similarity: bool
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at coordinates that are numbers of any arithmetic."""
+        return _formula_of_image(formula_of(self.inner), self.numbers, x, y, z)
 
     def evaluate(self, p: Vec3) -> Sample:
         local = type(p)(*self.numbers.local(p.x, p.y, p.z))
-        return self._image_sample(self.field.evaluate(local), self._term_bound(p, 0.0))
+        return self._image_sample(self.inner.evaluate(local), self._term_bound(p, 0.0))
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         """The three rows of the Hessian of f at p: of M^-T H M^-1 times the map's `value_factor`,
         where H is the Hessian of the inner solid at the preimage of p."""
         numbers = self.numbers
-        rows = self.field.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
+        rows = self.inner.hessian(type(p)(*numbers.local(p.x, p.y, p.z)))
         # `pull_back` multiplies a vector by M^-T. Applied to each row of H it gives the rows of H
         # M^-1; applied to the columns of that, M^-T H M^-1, which is symmetric.
         columns = [numbers.pull_back(row) for row in rows]
@@ -291,16 +333,16 @@ class TransformedSolid(SolidOfField):
         del sample
         numbers = self.numbers
         local = type(p)(*numbers.local(p.x, p.y, p.z))
-        first, second = self.field.derivative_errors(local, self.field.evaluate(local))
+        first, second = self.inner.derivative_errors(local, self.inner.evaluate(local))
         # The gradient is multiplied by M^-T and the factor, the Hessian by M^-T twice.
         first = first * numbers.stretch * numbers.factor
-        if not isinstance(self.field, FormulaSolid):
+        if not isinstance(self.inner, FormulaEvaluator):
             return first, second * numbers.stretch * numbers.stretch * numbers.factor
         coordinates = Jet.at_point(p, order=2)
-        jet = as_jet(self.formula(*coordinates), coordinates[0], type(self.field).__name__)
+        jet = as_jet(self.formula(*coordinates), coordinates[0], self.inner.name)
         # The gradient of the inner solid need not be the middle of its range
-        # (`Formula._with_one_sided_gradient`). So the half widths of the ranges are added to its
-        # error.
+        # (`FormulaEvaluator._with_one_sided_gradient`). So the half widths of the ranges are added
+        # to its error.
         # p.x tells `hessian_error` the type of the result.
         return first + sum(rate.radius for rate in jet.first_derivatives), hessian_error(jet, p.x)
 
@@ -320,7 +362,7 @@ class TransformedSolid(SolidOfField):
         # the speed to become lengths on the inner ray.
         speed = safe_norm(direction)
         inner_ray = Ray(vector(*numbers.local(o.x, o.y, o.z)), direction / speed, path.proofs)
-        ray_sample = self.field.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
+        ray_sample = self.inner.sample_ray(inner_ray, t * speed, ahead * speed, back * speed)
         sample = self._image_sample(ray_sample.sample, self._term_bound(o, t))
 
         def stretched(enclosures: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -366,7 +408,7 @@ class TransformedSolid(SolidOfField):
             """A proved bound of the image's function near the point, from a proved bound of the
             inner solid's function. If the map is no similarity, harmonic functions do not stay
             harmonic; so a bound that holds for harmonic functions is weakened first."""
-            if self.map.similarity is None:
+            if not self.is_similarity:
                 promise = promise.weakened_for_linear_maps(sample.value)
             return promise.scaled(factor).linearly_mapped(stretch)
 
@@ -417,22 +459,22 @@ class _InverseMap:
             float(np.abs(change.translation_vector).max()),
         )
 
-    def prepare(self, backend: Backend) -> _InverseMap:
+    def on_backend(self, backend: Backend) -> _InverseMap:
         """The same map with the entries of its matrix and its vector as kernel parameters of the
         backend (numbers that a compiled kernel reads when it runs). Entries that are 0 or 1 stay
         Python numbers: then their terms or products are left out of the kernel, which saves most of
         the work."""
-        prepared = with_device_numbers(self, backend)
+        parameters = with_device_numbers(self, backend)
         # The three rows and, as a fourth, the translation.
         rows = tuple(
             tuple(a if a in (0.0, 1.0) else b for a, b in zip(old, new, strict=True))
             for old, new in zip(
                 (*self.rows, self.translation_vector),
-                (*prepared.rows, prepared.translation_vector),
+                (*parameters.rows, parameters.translation_vector),
                 strict=True,
             )
         )
-        return replace(prepared, rows=rows[:3], translation_vector=rows[3])
+        return replace(parameters, rows=rows[:3], translation_vector=rows[3])
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The three coordinates of M^-1 (p - b), the preimage of the point p = (x, y, z).

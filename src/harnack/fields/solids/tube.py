@@ -8,17 +8,16 @@ numbers that it changes from one segment to the next."""
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.backend import FloatArray, IntArray
 from harnack.backend.elementary import clamp, fmax, fmin, max_norm
 from harnack.backend.record_table import RecordTable
 from harnack.backend.validation import (
@@ -33,9 +32,9 @@ from harnack.backend.validation import (
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, Promise, TaylorRemainder
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.batched_fields import cached_prepare
-from harnack.fields.field import Field
-from harnack.fields.patch_boxes import PatchBoxes, PatchField
+from harnack.fields.batched_fields import cached_upload
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
 from harnack.fields.solids.solid import Solid, box_around
 from harnack.geometry.beziers import flatten_bezier
 from harnack.tree.closest_triangles import MAX_BOXES
@@ -231,11 +230,14 @@ class Tube(Solid):
         x, y, z = (float(v) for v in 0.5 * (upper - lower) + reach)
         return box_around((x, y, z), tuple(float(v) for v in 0.5 * (lower + upper)))
 
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Tube:
-        """The same tube with its segments as records on the backend. If there are many, they are
-        grouped, and each group has a ball around it."""
-        prepared = copy.copy(self)
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        del plan
+        return _TubeEvaluator(self._upload(backend))
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> _TubeData:
+        """Upload the segments as records to a backend. If there are many, they are grouped, and
+        each group has a ball around it."""
         is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
         # The last vertex of a polyline is not joined to the first of the next.
         is_segment[[vertex - 1 for vertex in self.starts]] = False
@@ -246,12 +248,34 @@ class Tube(Solid):
         if len(rows) >= _MIN_SEGMENTS_FOR_GROUPS:
             rows, balls = _group_segments(rows)
             groups = RecordTable.upload(backend, balls)
-        object.__setattr__(prepared, "_records", RecordTable.upload(backend, rows))
-        object.__setattr__(prepared, "_groups", groups)
-        object.__setattr__(prepared, "_radius", dr.opaque(backend.Float, self.radius))
+        records = RecordTable.upload(backend, rows)
         size = float(np.abs(self.points).max()) + self.radius
-        object.__setattr__(prepared, "_size", dr.opaque(backend.Float, size))
-        return prepared
+        radius, size = (dr.opaque(backend.Float, length) for length in (self.radius, size))
+        return _TubeData(records, groups, radius, size)
+
+
+@dataclass(frozen=True)
+class _TubeData:
+    """The data of a tube on a backend.
+
+    records: for each segment a record of its start, the vector to its end, and 1 / length^2.
+    groups: for each group of segments a record of the center and the radius of a ball that contains
+        them; None for a small number of segments.
+    radius: of the tube.
+    size: a bound of the absolute values of coordinates on the tube.
+    """
+
+    records: RecordTable
+    groups: RecordTable | None
+    radius: Real
+    size: Real
+
+
+@dataclass(frozen=True, eq=False)
+class _TubeEvaluator(Evaluator):
+    """The evaluator of a `Tube`."""
+
+    data: _TubeData
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._sample_with_bounds(p, None, ())[0]
@@ -272,11 +296,8 @@ class Tube(Solid):
         # choice, which is the one that has `PiecewiseTaylorEnclosure`.
         if PiecewiseTaylorEnclosure not in path.proofs.kinds:
             return path.enclose(self.evaluate(p))
-        if not hasattr(self, "_records"):
-            # The last argument, `back`, is not used.
-            return self.prepare(backend_of(p)).sample_ray(path, t, ahead, ahead)
         # If `ahead` is infinite, the inner knots are fractions of another length.
-        endless_length = _ENDLESS_LENGTH * (max_norm(p) + self._parameter("_size"))
+        endless_length = _ENDLESS_LENGTH * (max_norm(p) + self.data.size)
         length = dr.select(dr.isfinite(ahead), ahead, endless_length)
         knots = (*(fraction * length for fraction in _KNOT_FRACTIONS), ahead)
         sample, distance, bounds = self._sample_with_bounds(p, path.direction, knots)
@@ -297,11 +318,9 @@ class Tube(Solid):
         direction: the unit directions of lines from p; None if there are no knots.
         knots: increasing lengths along these lines; the last may be infinite.
         """
-        if not hasattr(self, "_records"):
-            return self.prepare(backend_of(p))._sample_with_bounds(p, direction, knots)
         real, vector = cast("Any", type(p.x)), cast("Any", type(p))
         epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
-        records: RecordTable = cast("Any", self)._records
+        records, groups = self.data.records, self.data.groups
 
         def add_segment(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Return the state of the loop over segments after one more segment was visited.
@@ -337,7 +356,6 @@ class Tube(Solid):
         zero = 0 * p.x
         # The state before any segment.
         start = (zero + dr.inf, zero, zero, zero, zero, *(zero + dr.inf for _ in knots))
-        groups: RecordTable | None = cast("Any", self)._groups
         if groups is None:
             final = records.for_each(add_segment, start, "tube")
         else:
@@ -348,16 +366,12 @@ class Tube(Solid):
         distance, error = final[0], final[4]
         away = vector(*final[1:4])
         gradient = dr.select(distance > 0, away / distance, vector(0))
-        value = distance - self._parameter("_radius")
-        error = error + 4 * epsilon * (distance + self._parameter("_radius"))
+        value = distance - self.data.radius
+        error = error + 4 * epsilon * (distance + self.data.radius)
         # The error of a unit vector is that of the vector over its length, and at most 2.
         gradient_error = dr.select(distance > 0, fmin(4 * error / distance, 2), 2)
         sample = Sample(value, gradient, (Lipschitz(zero + 1),), error, gradient_error)
         return sample, distance, tuple(bound - distance - error for bound in final[5:])
-
-    def _parameter(self, name: str) -> Any:
-        """The attribute `name`, which is a number of the backend once the tube is prepared."""
-        return getattr(self, name)
 
 
 def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -389,9 +403,9 @@ def _add_segments_by_groups(
     start: tuple[Any, ...],
 ) -> tuple[Any, ...]:
     """Loop over groups of segments, and return the state of the loop over segments of
-    `Tube._sample_with_bounds` with all segments added. A group that is too far away to hold the
-    nearest segment is not visited: the distance from its ball takes the place of the distances from
-    its segments.
+    `_TubeEvaluator._sample_with_bounds` with all segments added. A group that is too far away to
+    hold the nearest segment is not visited: the distance from its ball takes the place of the
+    distances from its segments.
 
     p: the points.
     direction: the unit directions of lines from p; None if there are no knots.
@@ -559,7 +573,7 @@ _BOX_MARGIN = 1e-5
 _TAYLOR_RADIUS = 0.5
 
 
-class TubeNetwork(PatchField["_TubeBuffers"]):
+class TubeNetwork(PatchField):
     """The surfaces at distance `radius` from each of a set of segments, such as edges of meshes,
     wires or struts. Each segment is a patch: its tube is a level set of a function of its own, in a
     box of its own.
@@ -579,10 +593,13 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
     """
 
     default_level: float = 0.0
+    no_single_function = (
+        "tubes are no level set of one function, but of one for each segment: take "
+        "harnack.Tube for one polyline that is to be evaluated or combined with other solids"
+    )
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
         """Check points, segments and radius (see the class), and store them as NumPy arrays."""
-        super().__init__()
         array = as_real_array(points, "the points of tubes")
         check_vectors(array, "the points of tubes")
         self.points: FloatArray = np.array(array, dtype=np.float64)
@@ -595,43 +612,27 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
         """Return two arrays (m, 3): the lower and the upper corners of boxes. There is a box for
         each segment, which contains the segment's tube.
 
-        levels: values of f that are drawn; the largest is added to the radii. None for the levels
-            of the field.
+        levels: values of f that are drawn; the largest is added to the radii. None for the default
+            level.
         """
-        level = max(self.levels if levels is None else levels)
+        level = max((self.default_level,) if levels is None else levels)
         ends = self.points[self.segments]
         enlarged_radius = (self.radius + level)[:, None]
         lower, upper = ends.min(axis=1) - enlarged_radius, ends.max(axis=1) + enlarged_radius
         slack = _BOX_MARGIN * (upper - lower).max(axis=1)[:, None]
         return lower - slack, upper + slack
 
-    def evaluate(self, p: Vec3) -> NoReturn:
-        """Refuse to evaluate the field: there is no single function whose level set is the surface,
-        as each segment has a function of its own.
-
-        Raises:
-            TypeError: always.
-        """
-        del p
-        raise TypeError(
-            "tubes are no level set of one function, but of one for each segment: take "
-            "harnack.Tube for one polyline that is to be evaluated or combined with other solids"
-        )
-
-    def _upload(self, backend: Backend) -> _TubeBuffers:
+    @cached_upload
+    def _upload(self, backend: Backend, levels: tuple[float, ...]) -> _TubePatches:
         """Upload the boxes of all tubes, and the records of their segments, to a backend. Positions
         are relative to the center of the boxes, so that they are rounded less."""
-        boxes = PatchBoxes.upload(backend, *self.boxes())
+        boxes = PatchBoxes.upload(backend, *self.boxes(levels))
         center = np.array(boxes.center, dtype=np.float64).reshape(3)
         start, end = ((self.points[ends] - center) for ends in self.segments.T)
         segment = end - start
         inverse = 1.0 / (segment * segment).sum(axis=1)
         rows = np.column_stack([start, self.radius, segment, inverse])
-        return _TubeBuffers(boxes, RecordTable.upload(backend, rows))
-
-    def patch(self, index: Any) -> Field:
-        data = self._require_data()
-        return _Segment(data.boxes, data.segments.read_record(index))
+        return _TubePatches(boxes, RecordTable.upload(backend, rows))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level that leaves nothing of the thinnest tube."""
@@ -647,21 +648,23 @@ class TubeNetwork(PatchField["_TubeBuffers"]):
 
 
 @dataclass(frozen=True)
-class _TubeBuffers:
-    """The data of a network of tubes on a backend.
+class _TubePatches(PatchesInBoxes):
+    """The tubes of a network on a backend.
 
-    boxes: a box for each tube.
     segments: for each segment a record of its start, the radius of its tube, the vector from its
         start to its end, and 1 / length^2. Positions are relative to the center of the boxes.
     """
 
-    boxes: PatchBoxes
     segments: RecordTable
 
+    def patch(self, index: Any) -> Evaluator:
+        return _SegmentEvaluator(self.boxes, self.segments.read_record(index))
 
-class _Segment(Field):
-    """The field of one tube of a network: the distance D from its segment minus its radius r. Each
-    lane may have another segment.
+
+@dataclass(frozen=True, eq=False)
+class _SegmentEvaluator(Evaluator):
+    """The evaluator of one tube of a network: of the distance D from its segment minus its radius
+    r. Each lane may have another segment.
 
     boxes: the boxes of all tubes, of which only the center is used.
     row: the record of the segment: its start, the radius of its tube, the vector from its start to
@@ -674,18 +677,18 @@ class _Segment(Field):
     is at most 1/(D - s). Here s = D/2, so that the bound is 1/s.
     """
 
-    def __init__(self, boxes: PatchBoxes, row: list[Real]) -> None:
-        self._boxes, self._row = boxes, row
+    boxes: PatchBoxes
+    row: list[Real]
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value and gradient of D - r, with two proved bounds near p: the
         Lipschitz constant 1, and a bound of second derivatives on a ball."""
-        backend, row = self._boxes.backend, self._row
+        backend, row = self.boxes.backend, self.row
         vector, epsilon = backend.Array3f, 2 * backend.machine_epsilon
         # The record: the start of the segment (0 to 2), the radius (3), the vector from the start
         # to the end (4 to 6), and 1 / length^2 (7). Positions are relative to the center of the
         # boxes.
-        from_start = vector(p) - self._boxes.center - vector(*row[:3])
+        from_start = vector(p) - self.boxes.center - vector(*row[:3])
         segment = vector(*row[4:7])
         # The position of the segment's point nearest to p, as a fraction of the segment; and the
         # vector from that point to p.
