@@ -18,12 +18,14 @@ import drjit as dr
 import numpy as np
 
 import harnack as hk
+from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.record_table import RecordTable
 from harnack.enclosures import SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.fields.blobs.kernels import CompactKernel
-from harnack.fields.formula import Formula, FormulaOnRay
+from harnack.fields.evaluator import POINTS, Plan
+from harnack.fields.formula import Formula, FormulaEvaluator, FormulaOnRay
 from harnack.literature import clipped_power
 
 # Rounding of a blob's derivatives, in units of their largest absolute values.
@@ -128,17 +130,31 @@ class BlobFormula(Formula):
     scene: Scene
     exact: bool = True
     groups: int = 1
-    records: tuple[RecordTable, ...] = ()
     may_jump = False
 
-    def prepare(self, backend: Any) -> BlobFormula:
+    def evaluator(self, backend: Any, plan: Plan = POINTS) -> FormulaEvaluator:
+        del plan
+        return BlobEvaluator(self, self.formula_on(backend), None)
+
+    def formula_on(self, backend: Any) -> DeviceBlobs:
         scene = self.scene
         table = np.column_stack([scene.centers, scene.reaches**-2.0, scene.heights])
         tables = [RecordTable.upload(backend, table[k :: self.groups]) for k in range(self.groups)]
-        return dataclasses.replace(self, records=tuple(tables))
+        return DeviceBlobs(tuple(tables), scene.threshold, self.exact)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        assert self.records, "call prepare"
+        raise TypeError("the formula goes over records on a backend: take formula_on(backend)")
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceBlobs:
+    """The formula of a `BlobFormula`, with the records of the blobs of each group on a backend."""
+
+    records: tuple[RecordTable, ...]
+    threshold: float
+    exact: bool
+
+    def __call__(self, x: Any, y: Any, z: Any) -> Any:
         kernel = clipped_power(3)
 
         def blob(row: list[Any]) -> Any:
@@ -148,7 +164,15 @@ class BlobFormula(Formula):
         sums = [summed(group, blob) for group in self.records]
         for group in sums[1:]:
             sums[0] = hk.math.maximum(sums[0], group)
-        return sums[0] - self.scene.threshold
+        return sums[0] - self.threshold
+
+
+class BlobEvaluator(FormulaEvaluator):
+    """The evaluator of a `BlobFormula`."""
+
+    @property
+    def tally(self) -> Tally:
+        return tally_of(self.formula)
 
     def restrict(self, p: Any, direction: Any) -> BlobsAlong:
         return BlobsAlong(self, p, direction, piece_count=4)
@@ -161,7 +185,7 @@ class BlobsAlong(FormulaOnRay):
     def derivative_ranges(self, knots: Sequence[Any]) -> tuple[PathPiece, ...]:
         """With x = s - s0 along the path and S half the chord, the derivative of
         a (w0 - x^2/R^2)^3 has its extrema at x^2 = S^2/5, the second at 0 and x^2 = 3 S^2/5."""
-        field: Any = self.field
+        blobs: Any = self.evaluator.formula
         count = len(knots) - 1
         zero = 0 * self.p.x
 
@@ -189,7 +213,7 @@ class BlobsAlong(FormulaOnRay):
             new: list[Any] = []
             for k, (start, end) in enumerate(itertools.pairwise(knots)):
                 x, y = start - middle, end - middle
-                if field.exact:
+                if blobs.exact:
                     near = math.sqrt(0.2) * half
                     low, high = _extrema(first, x, y, half, (near, -near))
                 else:
@@ -203,7 +227,7 @@ class BlobsAlong(FormulaOnRay):
                 ]  # fmt: skip
             return tuple(new)
 
-        state = field.records[0].for_each(body, (zero,) * (4 * count), "blobs along")
+        state = blobs.records[0].for_each(body, (zero,) * (4 * count), "blobs along")
         return tuple(
             PathPiece(
                 end - start, SlopeRange(*state[4 * k : 4 * k + 2]), *state[4 * k + 2 : 4 * k + 4]

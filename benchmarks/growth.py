@@ -102,15 +102,14 @@ def at_points(series: str, vertices: FloatArray, faces: Any, method: Any) -> AtP
 
 
 def along_rays(series: str, elements: int, field: hk.Field) -> AlongRays:
-    """Trace the camera's rays; the field is uploaded before."""
+    """Trace the camera's rays; the first of the calls uploads the field."""
     backend = choose_backend()
     eye, directions = camera(WIDTH)
     o, d = to_vector3(backend, eye[None]), to_vector3(backend, directions)
-    prepared = field.evaluator(backend)
     hits: list[hk.Hits] = []
 
     def call() -> None:
-        hits[:] = [hk.trace(prepared, o, d, t_max=10.0, tolerance=1e-4)]
+        hits[:] = [hk.trace(field, o, d, t_max=10.0, tolerance=1e-4)]
         dr.sync_thread()
 
     call()  # compiles

@@ -20,9 +20,9 @@ def test_the_blobs_of_the_benchmark_and_of_the_library_are_the_same() -> None:
     points = to_vector3(backend, p)
     for groups in (1, 3):
         expected = SCENE.values(p, groups)
-        own = blobs.BlobFormula(SCENE, groups=groups).prepare(backend).evaluate(points)
+        own = blobs.BlobFormula(SCENE, groups=groups).evaluator(backend).evaluate(points)
         np.testing.assert_allclose(own.value.numpy(), expected, atol=1e-12)
-        library = SCENE.field(groups).prepare(backend).evaluate(points)
+        library = SCENE.field(groups).evaluator(backend).evaluate(points)
         np.testing.assert_allclose(library.value.numpy() - SCENE.threshold, expected, atol=1e-12)
 
 
