@@ -8,7 +8,7 @@ import inspect
 import math
 import pkgutil
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -42,6 +42,13 @@ from tests.oracles.direct_sums import dipole_sum, winding_sum
 from tests.oracles.exact import BOUNDS
 from tests.oracles.mutated_enclosure import mutated_enclosure
 from tests.oracles.step_contracts import check_steps
+
+
+class EvaluatedPlane(Field):
+    """A `Plane` whose evaluator consists of the function that gives samples."""
+
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        return hk.fields.EvaluateOnly(Plane().evaluate)
 
 
 class Charges(Field):
@@ -157,7 +164,7 @@ OWN: dict[str, Field] = {
     "charges": Charges(),
     "azimuth": Azimuth(),
     "plane": Plane(),
-    "evaluation only": hk.fields.EvaluateOnly(Plane().evaluate),
+    "evaluation only": EvaluatedPlane(),
     **{name: field for name, (field, _) in SOURCED.items()},
 }
 _POINTS = np.random.default_rng(5).normal(size=(60, 3))
@@ -223,7 +230,7 @@ SOME_PAIRS = [pair for pair in PAIRS if pair[0] in SOME]
 def test_the_list_names_every_promise(name: str) -> None:
     """So every proof that applies is tried; a sample is recorded and not computed."""
     backend = choose_backend("double")
-    sample = FIELDS[name].prepare(backend).evaluate(backend.Array3f(0.3, 0.2, 0.1))
+    sample = FIELDS[name].evaluator(backend).evaluate(backend.Array3f(0.3, 0.2, 0.1))
     zero = backend.Float(0)
     seen = sample.value, sample.value_error, SlopeRange(zero, zero)
     applies = {
@@ -342,7 +349,7 @@ def samples(field: Field, x: np.ndarray, fine: float = 1.0) -> tuple[Sample, Any
     fine: the accuracy scale, as `VariableAccuracy.at` takes it.
     """
     backend = choose_backend("double")
-    p, seen = to_vector3(backend, x), field.prepare(backend)
+    p, seen = to_vector3(backend, x), field.evaluator(backend)
     if seen.jumps is not None:
         up = backend.Array3f(0, 0, 1)
         nowhere = JumpCrossing(0.0, backend.UInt32(NO_FACET), backend.Float(0), up)
@@ -609,9 +616,14 @@ class Broken(Field):
     def extent(self, levels: tuple[float, ...]) -> Any:
         return self.around or self.of.extent(levels)
 
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        return BrokenEvaluator(self, backend)
+
+
+class BrokenEvaluator(hk.fields.SampleEvaluator):
     def differentiable_value(self, p: Any) -> Any:
-        value = super().differentiable_value(p)
-        return dr.replace_grad(value + self.differentiable, self.slope * value)
+        value, field = super().differentiable_value(p), cast("Broken", self.field)
+        return dr.replace_grad(value + field.differentiable, field.slope * value)
 
 
 def changed(sample: Sample, **new: Any) -> Sample:

@@ -241,7 +241,7 @@ def test_value_differentiates(name: str) -> None:
     p = points_in(field, 50)
     x = to_vector3(DOUBLE, p)
     dr.enable_grad(x)
-    dr.backward(field.differentiable_value(x))
+    dr.backward(field.evaluator(DOUBLE).differentiable_value(x))
     np.testing.assert_allclose(to_numpy(dr.grad(x)), gradient(field, p), atol=1e-10)
 
 

@@ -42,6 +42,16 @@ class Charge(Field):
         return Sample(self.strength / r, -self.strength * away / (r * r * r), (promise,))
 
 
+class Evaluated(Field):
+    """A field of a user whose evaluator consists of a function that gives samples."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+
+    def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.Evaluator:
+        return hk.fields.EvaluateOnly(self.function)
+
+
 def blobs(centers: Any, radii: Any, **others: Any) -> hk.Blobs:
     return hk.Blobs(centers, radii, **others)
 
@@ -205,9 +215,9 @@ _CASES: dict[str, _Case] = {
     "curves": (lambda radius: hk.SolidAngle([hk.geometry.Circle(radius), _TRIANGLE]),
                {"radius": 0.5}, {"loops.0", "loops.1.radius", "loops.1.center", "loops.1.normal"},
                ("loops.1.radius", 0.7, {"radius": 0.7})),
-    "evaluation only": (hk.fields.EvaluateOnly, {"evaluate": hk.Gyroid(1.0).evaluate}, set(),
-                        ("evaluate", hk.Gyroid(2.0).evaluate,
-                         {"evaluate": hk.Gyroid(2.0).evaluate})),
+    "evaluation only": (Evaluated, {"function": hk.Gyroid(1.0).evaluate}, set(),
+                        ("function", hk.Gyroid(2.0).evaluate,
+                         {"function": hk.Gyroid(2.0).evaluate})),
     "a user's": (Charge, {"center": (0.1, 0.2, 0.3)}, {"center", "strength"},
                  ("strength", 3.0, {"strength": 3.0})),
 }  # fmt: skip

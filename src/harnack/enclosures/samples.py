@@ -55,7 +55,7 @@ class Sample:
     alternative_promises: proved bounds that are also valid, but gave shorter steps than `promises`
         in every measurement. They are used only if the caller names the enclosures to use.
     ray_promises: bounds that hold only on one ray through p: Lipschitz constants of f there. Only
-        samples of `Field.sample_ray` have them.
+        samples of `Evaluator.sample_ray` have them.
     branch_unknown: a mask, true on lanes on which `value` may differ from f by an unknown integer
         (`VariableAccuracy.may_lack_integer`); None if there are no such lanes.
     """
