@@ -285,20 +285,21 @@ def test_rays_pass_where_all_squares_of_a_norm_are_zero() -> None:
 
 def test_which_formulas_are_steep() -> None:
     def steep(text: str) -> bool:
-        return hk.expression(text).is_steep
+        return hk.expression(text).evaluator(choose_backend("single")).is_steep
 
     assert not any(
         map(steep, ("x^4 + y^2 = 1", "sqrt(x^2 + 2*y^2 + 1) = z/3", "abs(x) = norm(y, z)"))
     )
     assert all(map(steep, ("sqrt(x*y)", "1/x", "x^0.3", "tan(x)", "log(x)", "x^y", "atan2(y, x)")))
-    assert not hk.Sphere().is_steep
-    assert (hk.Sphere() | hk.solid(hk.expression("sqrt(x)"), below=1)).is_steep
+    rooted = hk.Sphere() | hk.solid(hk.expression("sqrt(x)"), below=1)
+    assert not hk.Sphere().evaluator(choose_backend("single")).is_steep
+    assert rooted.evaluator(choose_backend("single")).is_steep
     assert not tally_of(lambda x, y, z: 2.0).is_steep
 
 
 def test_which_formulas_turn_within_rounding() -> None:
     def abrupt(text: str) -> bool:
-        return hk.expression(text).is_abrupt
+        return hk.expression(text).evaluator(choose_backend("single")).is_abrupt
 
     assert all(
         map(
@@ -339,7 +340,7 @@ class Steps(hk.solids.FormulaSolid):
 def test_numbers_are_told_before_they_are_data_of_a_kernel() -> None:
     steep, flat = Steps(), Steps(steepness=1.0)
     backend = choose_backend("single")
-    assert steep.is_abrupt
+    assert steep.evaluator(backend).is_abrupt
     assert steep.evaluator(backend).is_steep
     assert not flat.evaluator(backend).is_steep
     small = hk.Sphere(1e-5), hk.Cylinder(1e-3, 0.0002), hk.Cuboid((0.0002, 2.0, 2.0))

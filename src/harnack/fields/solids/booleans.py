@@ -161,7 +161,7 @@ class BooleanSolid(Solid):
         return _box_around_volumes(bounded)
 
     @property
-    def has_variable_accuracy(self) -> bool:
+    def has_variable_accuracy(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return any(part.has_variable_accuracy for part in self.parts)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

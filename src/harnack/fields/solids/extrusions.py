@@ -144,7 +144,7 @@ class Extrusion(Solid):
             (float(center_x), float(center_y), half_height),
         )
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _ExtrusionEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         del plan
         max_scale = max(1.0, self.taper)
         return _ExtrusionEvaluator(self._upload(backend), self.is_straight, max_scale)
@@ -162,9 +162,6 @@ class Extrusion(Solid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.formula_on(_backend_of_coordinate(x, type(self).__name__))(x, y, z)
-
-    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
-        return self.evaluator(backend).formula
 
 
 @dataclass(frozen=True)
@@ -637,7 +634,7 @@ class SolidOfRevolution(Solid):
         half = 0.5 * (upper - lower) + level
         return box_around((radius, radius, half), (0.0, 0.0, 0.5 * (lower + upper)))
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SolidOfRevolutionEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         del plan
         return _SolidOfRevolutionEvaluator(self._upload(backend))
 
@@ -648,9 +645,6 @@ class SolidOfRevolution(Solid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.formula_on(_backend_of_coordinate(x, type(self).__name__))(x, y, z)
-
-    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
-        return self.evaluator(backend).formula
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,7 +135,8 @@ class Julia(Solid):
         of the backend (numbers that a compiled kernel reads when it runs)."""
         del plan
         numbers = self.c, self.fourth_coordinate, math.hypot(*self.c), self.escape_radius
-        return _JuliaEvaluator(*_kernel_parameters(backend, numbers), self.iterations)
+        c, fourth_coordinate, size, radius = _kernel_parameters(backend, numbers)
+        return _JuliaEvaluator(c, fourth_coordinate, size, radius, self.iterations)
 
 
 @dataclass(frozen=True, eq=False)

@@ -205,7 +205,7 @@ class MeshSolid(Solid):
         x, y, z = (float(coordinate) for coordinate in half)
         return box_around((x, y, z), tuple(float(coordinate) for coordinate in center))
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _MeshSolidEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         del plan
         return _MeshSolidEvaluator(self._upload(backend))
 
@@ -217,9 +217,6 @@ class MeshSolid(Solid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         like = x.piece_length if is_jet(x, type(self).__name__) else x
         return self.formula_on(backend_of(like))(x, y, z)
-
-    def formula_on(self, backend: Backend) -> Callable[[Any, Any, Any], Any]:
-        return self.evaluator(backend).formula
 
 
 @dataclass(frozen=True, eq=False)

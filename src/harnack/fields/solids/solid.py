@@ -342,7 +342,7 @@ class SolidOfField(Solid):
         return solid
 
     @property
-    def has_variable_accuracy(self) -> bool:
+    def has_variable_accuracy(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.field.has_variable_accuracy
 
 

@@ -271,7 +271,7 @@ class TransformedSolid(SolidOfField):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         return _TransformedSolidEvaluator(
             self.field.evaluator(backend, without_levels(plan)),
-            self.inverse_map.on_backend(backend),
+            self.inverse_map.prepare(backend),
             is_similarity=self.map.similarity is not None,
         )
 
@@ -459,7 +459,7 @@ class _InverseMap:
             float(np.abs(change.translation_vector).max()),
         )
 
-    def on_backend(self, backend: Backend) -> _InverseMap:
+    def prepare(self, backend: Backend) -> _InverseMap:
         """The same map with the entries of its matrix and its vector as kernel parameters of the
         backend (numbers that a compiled kernel reads when it runs). Entries that are 0 or 1 stay
         Python numbers: then their terms or products are left out of the kernel, which saves most of
