@@ -143,8 +143,14 @@ class Field(Parametrized, abc.ABC):
         Raises:
             NotImplementedError: arguments with derivatives enabled, which would be lost because the
                 class does not have `has_parameter_derivatives`.
-            TypeError: an argument `domain` that is neither a volume nor None.
+            TypeError: the class defines neither `evaluate` nor `evaluator`; or an argument `domain`
+                that is neither a volume nor None.
         """
+        if cls.evaluate is Field.evaluate:
+            raise TypeError(
+                f"{cls.__name__} does not say what its function is: define evaluate(p), which "
+                "returns a harnack.fields.Sample"
+            )
         if not cls.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         field = super().__new__(cls)
@@ -229,14 +235,14 @@ class Field(Parametrized, abc.ABC):
     __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __neg__ = __abs__ = _is_no_number
     __lt__ = __le__ = __gt__ = __ge__ = _is_no_number
 
-    @abc.abstractmethod
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value and gradient of f, and promises (proved bounds of f near p). p is
         a Dr.Jit 3-vector of any backend and precision.
 
         It is called while a loop is being recorded. So use `drjit` functions of p, and no Python
-        branches on its values.
+        branches on its values. A class that defines `evaluator` need not define it.
         """
+        return self.evaluator(backend_of(p)).evaluate(p)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         """The object that samples f on a backend (a Dr.Jit device and precision): `Evaluator`. It
