@@ -46,7 +46,7 @@ class BatchedField(Field):
         defines_evaluator = "evaluator" in vars(cls)
         super().__init_subclass__(**kwargs)
         if "evaluate" in vars(cls) and not defines_evaluator:
-            cls.evaluator = BatchedField.evaluator
+            cls.evaluator = _evaluator_of_users_class
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -66,12 +66,6 @@ class BatchedField(Field):
         default is `values_at`; subclasses may compute the gradient more accurately (`sharpened`).
         It is not called while a loop is being recorded."""
         return self.values_at(x, 1)
-
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The default is for fields that define `evaluate`, which it calls. Second derivatives are
-        those of `values_at`."""
-        del plan
-        return _EvaluatorOfUsersClass(self, backend)
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -218,6 +212,14 @@ class _EvaluatorOfUsersClass(BatchedEvaluator, SampleEvaluator):
     """The evaluator of a `BatchedField` whose class defines `evaluate`."""
 
     field: Any
+
+
+def _evaluator_of_users_class(
+    self: BatchedField, backend: Backend, plan: Plan = POINTS
+) -> Evaluator:
+    """The method `evaluator` of a `BatchedField` whose class defines `evaluate`."""
+    del plan
+    return _EvaluatorOfUsersClass(self, backend)
 
 
 class SumData(Protocol):
