@@ -515,8 +515,10 @@ def _evaluate_by_inherited(
     @functools.wraps(evaluate)
     def evaluate_by_inherited(self: Any, p: Vec3) -> Sample:
         """The sample at p."""
-        owner, evaluator = vars(self).get("_inherited_evaluator", (None, None))
-        return evaluator.evaluate(p) if owner is kind else evaluate(self, p)
+        inherited: tuple[type[Field], Evaluator] | None = vars(self).get("_inherited_evaluator")
+        if inherited is None or inherited[0] is not kind:
+            return evaluate(self, p)
+        return inherited[1].evaluate(p)
 
     return evaluate_by_inherited
 
