@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import abc
 import functools
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar, cast
@@ -325,7 +324,6 @@ def _required_hessian(values: PointValues) -> SymmetricMatrix:
     return values.hessian
 
 
-Prepare = TypeVar("Prepare", bound=Callable[..., Field])
 Upload = TypeVar("Upload", bound=Callable[..., Any])
 Value = TypeVar("Value")
 
@@ -413,23 +411,3 @@ def cached_upload(upload: Upload) -> Upload:
         return data
 
     return cast("Upload", cached)
-
-
-def cached_prepare(prepare: Prepare) -> Prepare:
-    """Decorator of a field's method `prepare`, which uploads the field's data to a backend. The
-    decorated method uploads a field only once to each backend.
-
-    A field with parameters is uploaded at each call: a parameter may change in place, and its
-    derivatives belong to a single trace.
-    """
-    # For each backend a cache of prepared fields, without keys.
-    caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
-
-    @functools.wraps(prepare)
-    def cached(self: Field, backend: Backend) -> Field:
-        """The prepared field: the cached one, unless the field has parameters."""
-        if self.differentiable_parameters():
-            return prepare(self, backend)
-        return caches[backend].get(self, None, lambda: prepare(self, backend))
-
-    return cast("Prepare", cached)

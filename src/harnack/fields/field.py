@@ -515,7 +515,7 @@ def _evaluate_by_inherited(
     @functools.wraps(evaluate)
     def evaluate_by_inherited(self: Any, p: Vec3) -> Sample:
         """The sample at p."""
-        inherited: tuple[type[Field], Evaluator] | None = vars(self).get("_inherited_evaluator")
+        inherited = cast("dict[str, Any]", vars(self)).get("_inherited_evaluator")
         if inherited is None or inherited[0] is not kind:
             return evaluate(self, p)
         return inherited[1].evaluate(p)
