@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -619,8 +620,6 @@ class WindingEvaluator(BatchedEvaluator):
         none.
     """
 
-    field: WindingNumber
-
     def __init__(
         self,
         field: WindingNumber,
@@ -872,20 +871,12 @@ class _WindingOnInterval(Evaluator):
         accurate."""
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the function is sampled with another accuracy; None if all samples are equally
-        accurate. If there are FMM cells of edges, coarse samples may give w only up to an unknown
-        integer."""
-        winding, has_cells = self._on.winding, self._on.cells is not None
-        if not (winding.has_detail or has_cells):
-            return None
-        return VariableAccuracy(self._at_accuracy, winding.coarsest_detail, has_cells)
-
-    def _at_accuracy(self, detail: Real) -> Evaluator:
-        """The same function with samples of the accuracy scale `detail`."""
-        return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
+        has_cells = on.cells is not None
+        if on.winding.has_detail or has_cells:
+            # If there are FMM cells of edges, coarse samples may give w only up to an unknown
+            # integer.
+            at = functools.partial(_WindingOnInterval, on, frame, behind, offset)
+            self.variable_accuracy = VariableAccuracy(at, on.winding.coarsest_detail, has_cells)
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w at points p of the interval. On lanes on which it comes from an FMM cell of
