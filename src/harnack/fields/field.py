@@ -315,16 +315,18 @@ class Field(Parametrized, abc.ABC):
         del levels
         return self.domain
 
-    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
+    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
         """A grid of cells, in which some cells are marked as occupied. All other cells are proved
         to contain no point of the level sets of these levels. None if no such grid is known.
+
+        ray_count: the number of rays that will be traced; 0 if it is not known (`Plan.ray_count`).
 
         The default is None. Searches for first hits skip the cells that are not occupied. This
         saves time for fields that are expensive to evaluate. If f jumps across facets, there is a
         second condition: in a cell that is not occupied, f continued smoothly across the facets
         takes no level either.
         """
-        del levels
+        del levels, ray_count
         return None
 
     def operands(self) -> tuple[Field, ...]:
