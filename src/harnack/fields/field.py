@@ -13,7 +13,6 @@ import abc
 import copy
 import functools
 import inspect
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
@@ -22,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import backend_of
-from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.tensors import accepts_tensors
 from harnack.backend.validation import (
     check_no_derivatives,
@@ -85,11 +83,12 @@ class Field(Parametrized, abc.ABC):
     """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
     and its level set is the surface f = level. A sample at a point holds value and gradient of f
     there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
-    per lane. A prepared field has its data on a backend (a Dr.Jit device and precision).
+    per lane.
 
-    Subclasses define `evaluate`. The class attributes are defaults, which an instance may override.
-    Optional capabilities are objects (`capabilities`): `jumps`, `modulo_one`, `patches`,
-    `boundary` and `variable_accuracy`. They are None for a field that has none of these.
+    A field describes f. What samples f on a backend (a Dr.Jit device and precision) is its
+    `evaluator`. Subclasses define `evaluate`, or `evaluator` if they have data to upload, or can do
+    more than be sampled; the other of the two methods follows. The class attributes are defaults,
+    which an instance may override.
     """
 
     period: ClassVar[float | None] = None
@@ -128,6 +127,17 @@ class Field(Parametrized, abc.ABC):
     has_creases: bool = False
     """Whether the gradient may jump, as it does where the surfaces of a union meet."""
 
+    has_jumps: bool = False
+    """Whether f jumps across facets. Then `Evaluator.jumps` is an object."""
+
+    has_patches: bool = False
+    """Whether the surface is a union of patches, each a level set of a function of its own. Then
+    `Evaluator.patches` is an object."""
+
+    has_variable_accuracy: bool = False
+    """Whether f can be sampled with different accuracy. Then `Evaluator.variable_accuracy` is an
+    object."""
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Make a field, which remembers this call (`parameters`).
 
@@ -147,8 +157,8 @@ class Field(Parametrized, abc.ABC):
         checked. Its `hessian` is wrapped so that it also takes NumPy arrays. Its public class
         methods are wrapped so that they refuse arguments with derivatives enabled, as the
         constructor does. Unless the subclass defines `__repr__`, it gets that of `Field`. If it
-        defines `evaluate` but not `sample_ray`, it gets the `sample_ray` of `Field`, which calls
-        the new `evaluate`."""
+        defines only one of `evaluate` and `evaluator`, it gets the other one, which calls it: the
+        one of a base class might not."""
         super().__init_subclass__(**kwargs)
         if "__repr__" not in vars(cls):  # a dataclass would write out all numbers
             cls.__repr__ = Field.__repr__
@@ -161,8 +171,6 @@ class Field(Parametrized, abc.ABC):
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
-            if "sample_ray" not in vars(cls):  # a base's might not call this `evaluate`
-                cls.sample_ray = Field.sample_ray
             if "evaluator" not in vars(cls):  # a base's might not call this `evaluate`
                 cls.evaluator = Field.evaluator
         elif defines_evaluator:
@@ -235,12 +243,6 @@ class Field(Parametrized, abc.ABC):
         branches on its values.
         """
 
-    def prepare(self, backend: Backend) -> Any:
-        """(Until all families of fields define `evaluator`.)"""
-        if type(self).evaluator is not Field.evaluator:
-            return self.evaluator(backend)
-        return self
-
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         """The object that samples f on a backend (a Dr.Jit device and precision): `Evaluator`. It
         holds the data that are needed there. Each function of the library makes it once, before a
@@ -250,60 +252,14 @@ class Field(Parametrized, abc.ABC):
 
         The default is for fields that define `evaluate`, which it calls (`SampleEvaluator`).
         """
-        if type(self).__module__.startswith("harnack."):
-            ready: Any = self.for_ray_count(plan.ray_count)
-            return ready.with_levels(plan.levels).prepare(backend)
+        del plan
         return SampleEvaluator(self, backend)
-
-    @property
-    def has_jumps(self) -> bool:
-        """Whether f jumps across facets. Then `Evaluator.jumps` is an object."""
-        return self.jumps is not None
-
-    @property
-    def has_patches(self) -> bool:
-        """Whether the surface is a union of patches. Then `Evaluator.patches` is an object."""
-        return self.patches is not None
-
-    @property
-    def has_variable_accuracy(self) -> bool:
-        """Whether f can be sampled with different accuracy. Then `Evaluator.variable_accuracy` is
-        an object."""
-        return self.variable_accuracy is not None
-
-    @property
-    def jumps(self) -> Jumps | None:
-        """The facets across which f jumps; None, the default, for a field without jumps."""
-        return None
-
-    @property
-    def modulo_one(self) -> ModuloOne | None:
-        """How f is sampled up to an unknown integer; None, the default, if it is not."""
-        return None
-
-    @property
-    def patches(self) -> Patches | None:
-        """The patches of a surface that is a union of many level sets, each of a function of its
-        own; None, the default, for a field with one function."""
-        return None
 
     @property
     def boundary(self) -> Boundary | None:
         """The curves and points at which all level sets end; None, the default, if there are
         none."""
         return None
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        """How f is sampled with different accuracy; None, the default, for a single accuracy."""
-        return None
-
-    def with_levels(self, levels: tuple[float, ...]) -> Field:
-        """The field by which the level sets of these levels are traced, not yet prepared for a
-        backend; for example with the boxes of their patches. Equal levels must return the same
-        object. The default is the field itself."""
-        del levels
-        return self
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain every point of the level sets of these levels; None if
@@ -335,55 +291,10 @@ class Field(Parametrized, abc.ABC):
         is no combination is its own only operand."""
         return (self,)
 
-    def for_ray_count(self, count: int) -> Field:
-        """The field to use when `count` rays are traced: for many rays, a longer preparation may
-        save time. Equal counts must return the same object, so that nothing is prepared twice. The
-        default is the field itself."""
-        del count
-        return self
-
-    @property
-    def is_steep(self) -> bool:
-        """Whether f may change by any amount within the tolerance of a hit. This is so if |grad f|
-        may be unbounded in a bounded box, or if its bound is so large that f may change by any
-        amount within the rounding of coordinates. The tracer then also samples f behind the hit."""
-        return False
-
-    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
-        """A proved bound of |grad f(y) - grad f(p)| for all y with |y - p| <= radius. It is
-        infinite, which is the default, if none is known. With it, meshing proves that a mesh has
-        the topology of the surface."""
-        return 0 * p.x + radius + dr.inf
-
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError if f is proved never to take one of the levels. The default accepts all
         levels."""
         del levels
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's
-        parameters.
-
-        With respect to p it can be differentiated once: its derivative is the gradient of the
-        sample. So no derivative passes through `evaluate`, which may run a recorded loop. This
-        holds at ties of a formula, too (points where the two arguments of a maximum or minimum are
-        equal). A field with parameters overrides this method if `evaluate` cannot be differentiated
-        in both modes.
-        """
-        if type(self).evaluator is not Field.evaluator:
-            return self.evaluator(backend_of(p)).differentiable_value(p)
-        if any(dr.grad_enabled(parameter) for parameter in self.differentiable_parameters()):
-            return self.evaluate(p).value
-        refuse_hidden_parameters(self)
-        at = dr.detach(p)
-        with dr.suspend_grad():
-            sample = self.evaluate(at)
-        # Dr.Jit would drop a gradient that is the literal 0, and with it the dependence on p. A
-        # kernel parameter is no literal.
-        gradient = as_kernel_parameters(sample.gradient)
-        # The value of the first argument with the derivative of the second one. `at` is p without
-        # derivatives, so p - at is 0 and has the derivative 1.
-        return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -403,7 +314,7 @@ class Field(Parametrized, abc.ABC):
         if dr.is_array_v(type(points)):
             refuse_hidden_parameters(self)
             if any(dr.grad_enabled(array) for array in (points, *self.differentiable_parameters())):
-                return self.differentiable_value(points)
+                return self.evaluator(backend_of(points)).differentiable_value(points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
 
@@ -464,13 +375,6 @@ class Field(Parametrized, abc.ABC):
         """
         return self.evaluator(backend_of(p)).hessian(p)
 
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        """Two error bounds at the point p of a sample: of the gradient, as a length, and of
-        `hessian`, in the spectral norm. The default for the gradient is the sample's
-        `gradient_error`. For the Hessian it is infinity, because its error is not known."""
-        del p
-        return sample.gradient_error, math.inf
-
     def describe(self) -> dict[str, Any]:
         """The choices that the field made by itself, such as a method or an accuracy, as a
         dictionary from names to values that is shown to users.
@@ -478,21 +382,6 @@ class Field(Parametrized, abc.ABC):
         The default is empty.
         """
         return {}
-
-    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        """The sample at the point of a ray with parameter t, and enclosures: intervals that are
-        proved to hold the change of f along the ray, in front of that point and behind it.
-
-        path: the ray.
-        ahead, back: the lengths of ray in front of and behind the point up to which enclosures are
-            useful. An enclosure may hold on a shorter length, if it is sharper there.
-
-        The default evaluates the field at that point. The enclosures follow from the promises of
-        the sample (proved bounds of f near the point) and from the slope of f along the ray. A
-        field that knows more about f along a ray than in all directions overrides this.
-        """
-        del ahead, back
-        return path.enclose(self.evaluate(path.point(t)))
 
 
 def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[Any, Vec3], Sample]:
