@@ -12,7 +12,9 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
+from harnack.fields import Plan
 from harnack.fields.solid_angles import winding_number
+from harnack.fields.solid_angles.cell_options import NO_CELLS
 from harnack.fmm import dipole_cells
 from harnack.fmm.dipole_cells import DipoleCells
 from harnack.fmm.dipole_expansion import triangle_sources
@@ -52,8 +54,8 @@ def soup(mesh: Mesh, cells: Any = True) -> hk.WindingNumber:
     return hk.WindingNumber(*mesh, method="tree", cells=cells)
 
 
-def cells_of(field: hk.WindingNumber, precision: Any = "single") -> DipoleCells:
-    cells = field.traced_data(choose_backend(precision)).built
+def cells_of(field: hk.WindingNumber, precision: Any = "single", ray_count: int = 0) -> DipoleCells:
+    cells = field.evaluator(choose_backend(precision), Plan(ray_count=ray_count)).data.built
     assert isinstance(cells, DipoleCells)
     return cells
 
@@ -268,12 +270,15 @@ def test_when_there_are_cells_of_triangles() -> None:
     field = hk.WindingNumber(*mesh)
     assert field.method == "tree"
     assert field.describe()["cells"] == "from 15,360 rays on"
-    assert field.for_ray_count(15_000) is field
-    prepared = field.for_ray_count(20_000).prepare(choose_backend("single"))
-    cells = cells_of(prepared)
-    assert prepared.describe()["cells"] == f"{cells.count} of {cells.size / 1e6:.1f} MB"
-    assert prepared.modulo_one is None
-    short = soup(mesh, 0.01).prepare(choose_backend("single"))
+    backend = choose_backend("single")
+    assert field.evaluator(backend, Plan(ray_count=15_000)).data is field.evaluator(backend).data
+    evaluator, cells = (
+        field.evaluator(backend, Plan(ray_count=20_000)),
+        cells_of(field, "single", 20_000),
+    )
+    assert evaluator.describe()["cells"] == f"{cells.count} of {cells.size / 1e6:.1f} MB"
+    assert evaluator.modulo_one is None
+    short = soup(mesh, 0.01).evaluator(backend)
     assert short.describe()["cells"] == "none, as they need more memory"
     coarse = cells_of(soup(mesh, 2.0))
     assert coarse.size <= 2e6 < cells.size
@@ -285,12 +290,13 @@ def test_few_or_large_triangles_and_shared_edges_have_cells_of_edges(
     """Where triangles are as large as all of the soup, all of them are near."""
     vertices, faces = bumpy_sphere(2)
     for mesh in (scattered(300, 0.5), (vertices, remove_faces(faces, 0.1, 0))):
-        field, backend = soup(mesh), choose_backend("single")
-        assert field.traced_data(backend).cells is not None
-        assert field.evaluator(backend).modulo_one is not None
+        evaluator = soup(mesh).evaluator(choose_backend("single"))
+        assert evaluator.data.cells is not None
+        assert evaluator.modulo_one is not None
     monkeypatch.setattr(winding_number, "_MOST_OF_SOUP", 100)
-    assert soup(torn(2, 0.01), None).for_ray_count(10**9).cells is None
-    assert soup(icosphere(1), True).prepare(choose_backend("single")).describe()["triangles"] == 80
+    assert soup(torn(2, 0.01), None).cell_choice(10**9) == NO_CELLS
+    closed = soup(icosphere(1), True).evaluator(choose_backend("single"))
+    assert closed.describe()["triangles"] == 80
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

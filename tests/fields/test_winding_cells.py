@@ -13,7 +13,8 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.enclosures import Levels, Lipschitz, choose_enclosures
 from harnack.enclosures.samples import Ray
-from harnack.fields import Sample
+from harnack.fields import Plan, Sample
+from harnack.fields.solid_angles.cell_options import NO_CELLS
 from harnack.fields.solid_angles.winding_number import WindingModuloOne
 from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_faces
 from harnack.tracer.branch_tracker import BranchTracker
@@ -176,17 +177,19 @@ def test_when_there_are_cells() -> None:
     edges = field.describe()["singular edges"]
     assert edges > 64
     assert field.describe()["cells"] == "from 5,000 rays on"
-    assert field.for_ray_count(100) is field
-    assert field.for_ray_count(10**6).cells is True
-    assert field.for_ray_count(10**6) is field.for_ray_count(2 * 10**6)
-    prepared = field.for_ray_count(10**6).prepare(choose_backend("single"))
-    assert prepared.describe()["cells"].endswith("MB")
-    assert prepared.modulo_one is not None
-    short = with_cells(mesh, 0.01).prepare(choose_backend("single"))
+    backend = choose_backend("single")
+    few, many, more = (field.evaluator(backend, Plan(ray_count=n)) for n in (100, 10**6, 2 * 10**6))
+    assert few.data is field.evaluator(backend).data
+    assert few.modulo_one is None
+    assert few.describe()["cells"] == "from 5,000 rays on"
+    assert many.data is more.data
+    assert many.describe()["cells"].endswith("MB")
+    assert many.modulo_one is not None
+    short = with_cells(mesh, 0.01).evaluator(backend)
     assert short.describe()["cells"] == "none, as they need more memory"
     assert short.modulo_one is None
-    assert hk.WindingNumber(*icosphere(1)).for_ray_count(10**9).cells is None
-    assert with_cells(mesh, False).for_ray_count(10**9).cells is False
+    assert hk.WindingNumber(*icosphere(1)).cell_choice(10**9) == NO_CELLS
+    assert with_cells(mesh, False).cell_choice(10**9) == NO_CELLS
     with pytest.raises(ValueError, match="megabytes"):
         with_cells(mesh, -1.0)
 
@@ -334,7 +337,8 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     middles of cells, as corners of the lattice are."""
     field, backend = with_cells(mesh), choose_backend(precision)
     field.extent((0.5,))
-    modulo_one, cells = field.evaluator(backend).modulo_one, field.traced_data(backend).cells
+    evaluator = field.evaluator(backend)
+    modulo_one, cells = evaluator.modulo_one, evaluator.data.cells
     assert modulo_one is not None
     assert cells is not None
     rng, size, n = np.random.default_rng(6), float(np.ptp(mesh[0], axis=0).max()), 4000
@@ -369,7 +373,7 @@ def test_a_poor_value_in_the_middle_of_a_cell_is_not_used() -> None:
     mesh = corners.reshape(-1, 3), np.arange(900).reshape(-1, 3)
     field = with_cells(mesh, method="tree", accuracy=1.5, order=0)
     field.extent((0.5,))
-    cells = field.traced_data(choose_backend("single")).cells
+    cells = field.evaluator(choose_backend("single")).data.cells
     assert cells is not None
     assert cells.size == cells.cells.size + 4 * cells.count
     poor = field.error_bound(cells.cells.centers() * field.mesh.size + field.mesh.center) > 0.13

@@ -97,7 +97,7 @@ def test_hits_are_those_without_cells() -> None:
     o = 4 * unit(rng.normal(size=(5000, 3)))
     d = unit(rng.uniform(-1, 1, (5000, 3)) * [1.0, 0.6, 1.4] - o)
     fast = hk.trace(field, o, d, precision="single", tolerance=1e-4)
-    field.occupied_cells = lambda levels: None  # pyright: ignore[reportAttributeAccessIssue]
+    field.occupied_cells = lambda levels, ray_count: None  # pyright: ignore[reportAttributeAccessIssue]
     plain = hk.trace(field, o, d, precision="single", tolerance=1e-4)
     assert (fast.status == plain.status).all()
     hit = plain.is_hit

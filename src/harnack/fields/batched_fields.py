@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import abc
 import functools
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar, cast
@@ -46,7 +45,7 @@ class BatchedField(Field):
         defines_evaluator = "evaluator" in vars(cls)
         super().__init_subclass__(**kwargs)
         if "evaluate" in vars(cls) and not defines_evaluator:
-            cls.evaluator = BatchedField.evaluator
+            cls.evaluator = _evaluator_of_users_class
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -66,12 +65,6 @@ class BatchedField(Field):
         default is `values_at`; subclasses may compute the gradient more accurately (`sharpened`).
         It is not called while a loop is being recorded."""
         return self.values_at(x, 1)
-
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The default is for fields that define `evaluate`, which it calls. Second derivatives are
-        those of `values_at`."""
-        del plan
-        return _EvaluatorOfUsersClass(self, backend)
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -220,6 +213,14 @@ class _EvaluatorOfUsersClass(BatchedEvaluator, SampleEvaluator):
     field: Any
 
 
+def _evaluator_of_users_class(
+    self: BatchedField, backend: Backend, plan: Plan = POINTS
+) -> Evaluator:
+    """The method `evaluator` of a `BatchedField` whose class defines `evaluate`."""
+    del plan
+    return _EvaluatorOfUsersClass(self, backend)
+
+
 class SumData(Protocol):
     """A sum over sources on a backend, which is sampled at any accuracy. The accuracy scale says
     how accurately: larger is more accurate (`VariableAccuracy`)."""
@@ -323,7 +324,6 @@ def _required_hessian(values: PointValues) -> SymmetricMatrix:
     return values.hessian
 
 
-Prepare = TypeVar("Prepare", bound=Callable[..., Field])
 Upload = TypeVar("Upload", bound=Callable[..., Any])
 Value = TypeVar("Value")
 
@@ -411,23 +411,3 @@ def cached_upload(upload: Upload) -> Upload:
         return data
 
     return cast("Upload", cached)
-
-
-def cached_prepare(prepare: Prepare) -> Prepare:
-    """Decorator of a field's method `prepare`, which uploads the field's data to a backend. The
-    decorated method uploads a field only once to each backend.
-
-    A field with parameters is uploaded at each call: a parameter may change in place, and its
-    derivatives belong to a single trace.
-    """
-    # For each backend a cache of prepared fields, without keys.
-    caches: defaultdict[Backend, FieldCache[Field]] = defaultdict(FieldCache)
-
-    @functools.wraps(prepare)
-    def cached(self: Field, backend: Backend) -> Field:
-        """The prepared field: the cached one, unless the field has parameters."""
-        if self.differentiable_parameters():
-            return prepare(self, backend)
-        return caches[backend].get(self, None, lambda: prepare(self, backend))
-
-    return cast("Prepare", cached)

@@ -2,26 +2,19 @@
 and the volumes that follow from them. A field is a function f of space. Its sample at a point holds
 value and gradient there, and promises: proved bounds of f near the point. `clearance_function`
 gives clearances at points. `tight_extent` proves in which volume the level sets lie, and
-`occupied_cells` in which cells of a grid. Also here: `DeviceField`, the base of fields whose data
-lie on a backend (a Dr.Jit device and precision), in coordinates in which they have a size of about
-1."""
+`occupied_cells` in which cells of a grid."""
 
 from __future__ import annotations
 
-import abc
-import copy
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy, to_vector3
+from harnack.backend import FloatArray, choose_backend, to_numpy, to_vector3
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
-from harnack.fields.batched_fields import cached_prepare
 from harnack.fields.field import Field
-from harnack.fmm.unit_frame import UnitFrame
 from harnack.tree.empty_space import (
     BoxCells,
     OccupancyGrid,
@@ -31,8 +24,6 @@ from harnack.tree.empty_space import (
 )
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.enclosures.samples import Sample
     from harnack.fields.evaluator import Evaluator
@@ -198,54 +189,3 @@ def level_distance_lower_bound(
     if evaluator.jumps is not None:
         distance = fmin(distance, evaluator.jumps.distance(p))
     return fmax(backend.Float(distance) - 2 * epsilon * size, 0)
-
-
-Uploaded = TypeVar("Uploaded", bound=UnitFrame)
-
-
-class DeviceField(Field, Generic[Uploaded]):
-    """A field that is evaluated from data on a backend (a Dr.Jit device and precision), such as a
-    tree of triangles. A prepared field (the result of `prepare`) holds its data; a field that is
-    not prepared uploads them whenever it needs them. There may be two sets of data: one for tracing
-    rays, and one for values at large numbers of points. Subclasses define `_upload`."""
-
-    def __init__(self) -> None:
-        self._device: Uploaded | None = None
-        self._batches: TransientCache[Backend, Uploaded] = TransientCache()
-
-    @abc.abstractmethod
-    def _upload(self, backend: Backend, *, traced: bool) -> Uploaded:
-        """Upload the field's data to a backend, and return them.
-
-        traced: True for the data for tracing rays; False for the data for values at points.
-        """
-
-    @cached_prepare
-    def prepare(self, backend: Backend) -> Self:
-        if self._device is not None and self._device.backend is backend:
-            return self
-        prepared = copy.copy(self)
-        prepared._device = self._upload(backend, traced=True)
-        return prepared
-
-    def _data_for(self, p: Vec3) -> Uploaded:
-        """The data for tracing: those of the prepared field; or, if the field is not prepared, data
-        that are uploaded now to the backend of the points p."""
-        if self._device is None:
-            return self._upload(backend_of(p), traced=True)
-        return self._device
-
-    def _require_data(self) -> Uploaded:
-        """The data for tracing, which `prepare` uploaded.
-
-        Raises:
-            RuntimeError: `prepare` was not called.
-        """
-        if self._device is None:
-            raise RuntimeError("prepare(backend) comes first")
-        return self._device
-
-    def _batch_data(self, backend: Backend) -> Uploaded:
-        """The data for values at points, which are uploaded once for each backend and then
-        cached."""
-        return self._batches.get_or_make(backend, lambda: self._upload(backend, traced=False))

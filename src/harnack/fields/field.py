@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import functools
 import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -172,14 +173,18 @@ class Field(Parametrized, abc.ABC):
             if isinstance(attribute, classmethod) and not name.startswith("_"):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
                 setattr(cls, name, classmethod(checked_maker))
+        defines_evaluator = "evaluator" in vars(cls)
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
             if "evaluator" not in vars(cls):  # a base's might not call this `evaluate`
                 cls.evaluator = Field.evaluator
-        elif "evaluator" in vars(cls):
+        elif defines_evaluator:
             evaluate_by: Any = _evaluate_by(cls.evaluator)
             cls.evaluate = evaluate_by
+        if defines_evaluator:
+            by_inherited: Any = _evaluate_by_inherited(cls, cls.evaluate)
+            cls.evaluate = by_inherited
         if "hessian" in vars(cls):
             general: Any = accepts_numpy_points(cls.hessian)
             cls.hessian = general
@@ -272,16 +277,18 @@ class Field(Parametrized, abc.ABC):
         del levels
         return self.domain
 
-    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
+    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
         """A grid of cells, in which some cells are marked as occupied. All other cells are proved
         to contain no point of the level sets of these levels. None if no such grid is known.
+
+        ray_count: the number of rays that will be traced; 0 if it is not known (`Plan.ray_count`).
 
         The default is None. Searches for first hits skip the cells that are not occupied. This
         saves time for fields that are expensive to evaluate. If f jumps across facets, there is a
         second condition: in a cell that is not occupied, f continued smoothly across the facets
         takes no level either.
         """
-        del levels
+        del levels, ray_count
         return None
 
     def operands(self) -> tuple[Field, ...]:
@@ -390,15 +397,51 @@ def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[An
         """The sample at p, by the evaluator of the class that was wrapped."""
         return evaluator(self, backend_of(p)).evaluate(p)
 
-    cast("Any", evaluate).is_derived = True  # `_stated_evaluate` passes it over
+    cast("Any", evaluate).is_derived = True  # `_stating_class` passes it over
     return evaluate
 
 
-def _stated_evaluate(kind: type[Field]) -> Callable[[Any, Vec3], Sample]:
-    """The `evaluate` that a class of fields states itself, or inherits from one that does, and that
-    was not made of its `evaluator`."""
-    methods = [vars(base)["evaluate"] for base in kind.__mro__ if "evaluate" in vars(base)]
-    return next(method for method in methods if not getattr(method, "is_derived", False))
+def _evaluate_by_inherited(
+    kind: type[Field], evaluate: Callable[[Any, Vec3], Sample]
+) -> Callable[[Any, Vec3], Sample]:
+    """The method `evaluate` of a class `kind` that defines `evaluator`, for the call of
+    super().evaluate(p) by the `evaluate` of a subclass. That may be while a kernel is recorded,
+    when no evaluator can be made. So the evaluator is an attribute that was set before
+    (`_with_inherited_evaluator`). Without it the result is that of `evaluate`."""
+
+    @functools.wraps(evaluate)
+    def evaluate_by_inherited(self: Any, p: Vec3) -> Sample:
+        """The sample at p."""
+        inherited = cast("dict[str, Any]", vars(self)).get("_inherited_evaluator")
+        if inherited is None or inherited[0] is not kind:
+            return evaluate(self, p)
+        return inherited[1].evaluate(p)
+
+    return evaluate_by_inherited
+
+
+def _with_inherited_evaluator(field: Field, origin: Field, backend: Backend) -> Field:
+    """The field, or a copy that is ready for the call of super().evaluate(p) by the `evaluate` of
+    its class. The copy is made if that calls a class of this library that defines `evaluator`.
+
+    origin: the field as the user made it, of which `field` may be a copy.
+    """
+    kinds = type(field).__mro__
+    for kind in kinds[kinds.index(_stating_class(type(field))) + 1 :]:
+        evaluator = vars(kind).get("evaluator", Field.evaluator)
+        if kind.__module__.startswith("harnack.") and evaluator is not Field.evaluator:
+            other = copy.copy(field)
+            inherited = kind, evaluator(origin, backend)
+            object.__setattr__(other, "_inherited_evaluator", inherited)
+            return other
+    return field
+
+
+def _stating_class(kind: type[Field]) -> type[Field]:
+    """The class of fields that states the `evaluate` of a class: the class itself, or the base from
+    which it inherits the method. Methods that were made of `evaluator` do not count."""
+    bases = [base for base in kind.__mro__ if "evaluate" in vars(base)]
+    return next(base for base in bases if not getattr(vars(base)["evaluate"], "is_derived", False))
 
 
 class SampleEvaluator(Evaluator):
@@ -425,8 +468,9 @@ class SampleEvaluator(Evaluator):
         variable_accuracy: VariableAccuracy | None = None,
         is_steep: bool = False,
     ) -> None:
-        self.field = _with_ready_fields(field, backend)
-        self._evaluate = _stated_evaluate(type(field))
+        ready = _with_ready_fields(field, backend)
+        self.field = _with_inherited_evaluator(ready, field, backend)
+        self._evaluate = vars(_stating_class(type(field)))["evaluate"]
         self.jumps, self.modulo_one, self.patches = jumps, modulo_one, patches
         self.variable_accuracy, self.is_steep = variable_accuracy, is_steep
 

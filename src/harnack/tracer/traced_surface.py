@@ -261,11 +261,16 @@ class TracedSurface:
         # `largest` is a number of cells, 0 for all components. Results are kept for this field,
         # these levels and a key; the key has what else they depend on.
         if not self.largest:
-            return self.memoize("cells", lambda: self.field.occupied_cells(self.level_values))
+            key, arguments = ("cells", self.ray_count), (self.level_values, self.ray_count)
+            return self.memoize(key, lambda: self.field.occupied_cells(*arguments))
         volume = intersection_of([self.field.domain, self.extent, self.clip])
-        arguments = self.field, self.level_values, volume, self.solid_range, self.largest
         key = "largest", self.clip, self.side, self.largest
-        return self.memoize(key, lambda: largest_component_cells(*arguments))
+        return self.memoize(
+            key,
+            lambda: largest_component_cells(
+                self.field, self.level_values, volume, self.solid_range, self.largest
+            ),
+        )
 
     def _check_size(self, backend: Backend) -> None:
         """Raise ValueError if the surface is too large or too small for a backend's precision."""

@@ -18,7 +18,6 @@ than their error bounds.
 from __future__ import annotations
 
 import abc
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,8 +29,6 @@ from harnack.cluster.serialization import TransientCache
 from harnack.fields.field import Field
 
 if TYPE_CHECKING:
-    from typing import Self
-
     from harnack.backend import Backend
 
 __all__ = ["NO_CELLS", "BuiltCells", "CellChoice", "FieldWithCells"]
@@ -99,18 +96,9 @@ class FieldWithCells(Field):
 
     cells: True for cells in any case, False for none, None if the number of rays decides, or a
         number of megabytes, for cells in any case with this limit of memory.
-    cells_for_values: whether values at points use the cells, too. It is true if the user requested
-        cells, whatever the number of points, so that values and their error bounds always come from
-        the same method.
-    finer_cells: whether cells are smaller, which takes longer to build them and saves time for very
-        many rays; true if the user requested cells.
     """
 
     cells: bool | float | None
-    cells_for_values: bool
-    finer_cells: bool
-    _device: Any
-    _batches: Any
 
     def configure_cells(self, cells: Any) -> None:
         """Set whether the field has FMM cells, and forget all cells that have been built. Values at
@@ -131,29 +119,8 @@ class FieldWithCells(Field):
                 f"cells must be True, False, a number of megabytes or None, not {cells!r}"
             )
         self.cells = cells
-        # finer_cells: cells that the user requests are of the smaller kind. The two caches: results
-        # of `with_cells` by `finer_cells`; and built cells by backend, bytes and `finer_cells`.
-        self.cells_for_values, self.finer_cells = bool(cells), True
-        self._with_cells: TransientCache[bool, Self] = TransientCache()
-        self._built: TransientCache[tuple[Backend, int, bool], Any] = TransientCache()
-        self._built_by_choice: TransientCache[tuple[Backend, CellChoice], Any] = TransientCache()
-
-    def with_cells(self, cells: bool = True) -> Self:
-        """Copy this field, with cells that are used for rays but not for values at points; or
-        without cells, for cells=False."""
-        field = copy.copy(self)
-        field.configure_cells(cells)
-        field.cells_for_values, field._device, field._batches = False, None, TransientCache()
-        return field
-
-    def build_cached(self, backend: Backend, build: Callable[[], Built]) -> Built:
-        """Return the cells of a backend, which are built once and used for values and for tracing.
-        They are built anew if the limit of bytes or `finer_cells` has changed.
-
-        build: a function that builds the cells.
-        """
-        key = backend, self.max_bytes(), self.finer_cells
-        return self._built.get_or_make(key, build)
+        # Built cells, by backend and choice.
+        self._built: TransientCache[tuple[Backend, CellChoice], Any] = TransientCache()
 
     def cell_choice(self, ray_count: int = 0) -> CellChoice:
         """The cells with which to trace `ray_count` rays. If the user left the choice open (`cells`
@@ -174,7 +141,7 @@ class FieldWithCells(Field):
 
         build: a function that builds the cells.
         """
-        return self._built_by_choice.get_or_make((backend, choice), build)
+        return self._built.get_or_make((backend, choice), build)
 
     @abc.abstractmethod
     def cells_pay_from(self) -> float:
@@ -184,24 +151,8 @@ class FieldWithCells(Field):
     def finer_cells_pay_from(self) -> float:
         """The smallest number of rays for which smaller cells save more time than their longer
         construction takes. It is 0 by default, for fields whose cells have only one size: they
-        ignore `finer_cells`."""
+        ignore `CellChoice.finer`."""
         return 0.0
-
-    def for_ray_count(self, count: int) -> Self:
-        """Return the field with which to trace `count` rays. It is a copy with cells if the user
-        left the choice open (`cells` is None) and there are so many rays that cells save time.
-        Otherwise it is this field itself."""
-        if self.cells is not None or not self.cells_pay_from() <= count:
-            return self
-        finer = self.finer_cells_pay_from() <= count
-        if finer not in self._with_cells:
-            self._with_cells[finer] = self.with_cells()
-            self._with_cells[finer].finer_cells = finer
-        return self._with_cells[finer]
-
-    def max_bytes(self) -> int:
-        """Compute the number of bytes that the cells may take; 0 if there are none."""
-        return int(1e6 * (_MEGABYTES if self.cells is True else float(self.cells or 0)))
 
     def describe_cell_option(self) -> dict[str, str]:
         """The entry "cells" of `describe`: how much memory cells may take; or, if the number of
@@ -211,23 +162,3 @@ class FieldWithCells(Field):
             return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
         choice = self.cell_choice()
         return {"cells": f"of at most {choice.max_bytes / 1e6:g} MB"} if choice else {}
-
-    def describe_cells(self, built: BuiltCells | None) -> dict[str, str]:
-        """Make the entry "cells" of `describe`, or an empty dictionary if the field has no cells.
-
-        built: the cells of a prepared field (whose data are on a backend); None if they would have
-            taken too much memory. It is not used if the field is not prepared.
-
-        For a prepared field the entry states the number and the memory of the cells; for another
-        one, how much memory they may take. If the number of rays decides, the entry states the
-        smallest number for which the field builds cells.
-        """
-        if self.cells is None and self.cells_pay_from() < math.inf:
-            return {"cells": f"from {math.ceil(self.cells_pay_from()):,} rays on"}
-        if not self.cells:
-            return {}
-        if self._device is None:  # not prepared
-            return {"cells": f"of at most {self.max_bytes() / 1e6:g} MB"}
-        if built is None:
-            return {"cells": "none, as they need more memory"}
-        return {"cells": f"{built.count} of {built.size / 1e6:.1f} MB"}

@@ -154,8 +154,8 @@ class Morph(BatchedField):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
 
-    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
-        return self._slice.occupied_cells(levels)
+    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
+        return self._slice.occupied_cells(levels, ray_count)
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:

@@ -561,9 +561,11 @@ class MorphSlice(SourceSum):
             )
         return self._extents[levels]
 
-    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid:
+    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid:
         """Compute, once, the cells of a grid over the extent that may contain a point of a level
-        set. The other cells are proved to contain none; rays skip them."""
+        set. The other cells are proved to contain none; rays skip them. They are the same for any
+        number of rays."""
+        del ray_count
         return self._occupied.get_or_make(
             levels, lambda: occupied_cells(self, levels, self.extent(levels), _CELLS_ACROSS)
         )

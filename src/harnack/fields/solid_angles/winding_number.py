@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -35,7 +36,8 @@ from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_integer_in_range, as_real, no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
-from harnack.fields.batched_fields import BatchedField, cached_upload
+from harnack.fields.batch_evaluation import evaluate_points
+from harnack.fields.batched_fields import BatchedEvaluator, BatchedField, cached_upload
 from harnack.fields.capabilities import (
     NO_FACET,
     JumpCrossing,
@@ -44,11 +46,16 @@ from harnack.fields.capabilities import (
     NearestFacet,
     VariableAccuracy,
 )
-from harnack.fields.clearance import DeviceField, occupied_cells, tight_extent
+from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.field import Field, Sample, space_scaled
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
-from harnack.fields.solid_angles.cell_options import BuiltCells, FieldWithCells
+from harnack.fields.solid_angles.cell_options import (
+    NO_CELLS,
+    BuiltCells,
+    CellChoice,
+    FieldWithCells,
+)
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
 from harnack.fields.solid_angles.winding_mesh import WindingMesh
@@ -92,13 +99,15 @@ class WindingModuloOne(Field):
     period: ClassVar[float | None] = 1.0
     has_variable_accuracy = True
 
-    def __init__(self, winding: WindingNumber) -> None:
-        """winding: the winding number w."""
-        self._winding = winding
+    def __init__(self, winding: WindingNumber, cells: CellChoice | None = None) -> None:
+        """winding: the winding number w. cells: the FMM cells from which samples come; None if the
+        number of rays decides, as for w."""
+        self._winding, self._cells = winding, cells
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         """The object that samples w modulo 1 on a backend. plan: what it will be used for."""
-        return _ModuloOneEvaluator(self._winding.traced_data(backend, plan.ray_count))
+        cells = self._winding.cell_choice(plan.ray_count) if self._cells is None else self._cells
+        return _ModuloOneEvaluator(self._winding.traced_data(backend, cells))
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that is proved to contain the level sets of w; None if there is no bounded
@@ -114,7 +123,7 @@ class _ModuloOneEvaluator(Evaluator):
     data: the mesh on the backend.
     """
 
-    def __init__(self, data: _WindingData) -> None:
+    def __init__(self, data: WindingData) -> None:
         """data: the mesh on the backend."""
         self._data = data
         # How w modulo 1 is sampled with another accuracy.
@@ -128,18 +137,18 @@ class _ModuloOneEvaluator(Evaluator):
 
 
 def winding_cells(
-    winding: WindingNumber, extent: Volume, levels: tuple[float, ...]
+    winding: WindingNumber, cells: CellChoice, extent: Volume, levels: tuple[float, ...]
 ) -> OccupancyGrid:
-    """A grid of cells over the volume `extent`, each marked as occupied or empty. A cell is empty
-    if the winding number w modulo 1 is proved to take none of the levels in it; triangles do not
-    matter."""
-    return occupied_cells(WindingModuloOne(winding), levels, extent, _CELLS_ACROSS)
+    """A grid over the volume `extent`, whose cells are marked as occupied or empty. One is empty if
+    the winding number w modulo 1 is proved to take none of the levels in it; triangles do not
+    matter. cells: the FMM cells from which samples of w come."""
+    return occupied_cells(WindingModuloOne(winding, cells), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(winding: WindingNumber, levels: tuple[float, ...]) -> Volume | None:
     """A polytope that is proved to contain the level sets of the winding number w of a mesh. For a
     closed mesh it is a box. There always is one; None occurs only in the type of the result, which
-    is that of `Field.extent`.
+    is that of `Field.extent`. It is computed without FMM cells.
 
     winding: the winding number.
     levels: the values of w whose level sets are meant.
@@ -158,7 +167,13 @@ def winding_extent(winding: WindingNumber, levels: tuple[float, ...]) -> Volume 
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
-        WindingModuloOne(winding), levels, lower, upper, _MAX_CELLS, _MAX_HALVINGS, corners
+        WindingModuloOne(winding, NO_CELLS),
+        levels,
+        lower,
+        upper,
+        _MAX_CELLS,
+        _MAX_HALVINGS,
+        corners,
     )
 
 
@@ -221,7 +236,7 @@ _EXACT_ERROR = 1e-6
 _TRIANGLE_ROUNDINGS = 8.0
 
 
-class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
+class WindingNumber(FieldWithCells, BatchedField):
     """The winding number w of a triangle mesh around a point, as a field (Jacobson et al. 2013). It
     can be computed exactly, from one ray through the triangles and the singular edges, at which
     triangles do not cancel; or by a tree with multipoles. Promises are proved bounds of w near a
@@ -293,7 +308,6 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         cells: whether to build FMM cells: True, False, None if they save time, or the number of
             megabytes that they may take.
         """
-        super().__init__()
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
             raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
@@ -309,9 +323,11 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         self.configure_cells(cells)
         # What is computed once for a tuple of levels.
         self._extents: TransientCache[tuple[float, ...], Volume | None] = TransientCache()
-        self._occupied: TransientCache[tuple[float, ...], OccupancyGrid] = TransientCache()
         self._own_levels: TransientCache[tuple[float, ...], bool] = TransientCache()
-        self._rates: TransientCache[Backend, BoundaryRates] = TransientCache()
+        # Grids of cells, by the FMM cells from which samples come, and by the levels.
+        self._occupied: TransientCache[tuple[CellChoice, tuple[float, ...]], OccupancyGrid] = (
+            TransientCache()
+        )
 
     @no_derivatives
     def with_vertices(self, vertices: Any) -> WindingNumber:
@@ -328,8 +344,8 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         field = copy.copy(self)
         field._mesh = self.mesh.with_vertices(vertices)
         # What was computed from the old positions is dropped.
-        field._rates, field._own_levels = TransientCache(), TransientCache()
         field._extents, field._occupied = TransientCache(), TransientCache()
+        field._own_levels = TransientCache()
         field.configure_cells(self.cells)
         return field
 
@@ -364,12 +380,18 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
 
         closer: the accuracy scale, for a tree; larger is more accurate.
         """
-        data = self._upload(backend_of(x), traced=False)
+        return self._values_from(self._values_data(backend_of(x)), x, derivatives, closer)
+
+    def _values_from(
+        self, data: WindingData, x: Vec3, derivatives: int, closer: Real
+    ) -> PointValues:
+        """w at points x and its derivatives, as `values_at` returns them, from the mesh on their
+        backend."""
         winding, x = data.winding, data.to_unit(x)
         if isinstance(winding, TreeWinding):
             if derivatives == 2 and self.accuracy is None:
                 # Second derivatives from the edges, and only the value from the tree.
-                rates = self._boundary_rates(data, winding).at(x, 2, closer)
+                rates = self._upload_rates(data.backend).at(x, 2, closer)
                 values = with_rates(winding.values(x, 0, closer), rates)
             else:
                 values = winding.values(x, derivatives, closer)
@@ -385,14 +407,14 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         tree, gradients come from the singular edges (`winding_rates`), unless the user chose the
         accuracy. The error of a gradient is then about 1 % of the gradient's length in most places,
         or far less."""
-        data = self._upload(backend_of(x), traced=False)
+        data = self._values_data(backend_of(x))
         winding = data.winding
         if not isinstance(winding, TreeWinding) or self.accuracy is not None:
             return self.values_at(x, 1)  # 1: with gradients
         x = data.to_unit(x)
         # So that the kernels below read x, and do not compute it again.
         dr.eval(x)
-        rates = self._boundary_rates(data, winding)
+        rates = self._upload_rates(data.backend)
         values = rates.sharp(x)
         # If the derivatives come from the tree over the triangles, so does the value. Otherwise
         # the result has derivatives only, and the value is computed by the tree.
@@ -400,18 +422,16 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             values = with_rates(winding.values(x, 0, data.backend.Float(1)), values)
         return self._stated(data, x, values)
 
-    def _boundary_rates(self, data: _WindingData, winding: TreeWinding) -> BoundaryRates:
+    @cached_upload
+    def _upload_rates(self, backend: Backend) -> BoundaryRates:
         """The object that evaluates the derivatives of w at points from the singular edges only
-        (`winding_rates`). It is made once for a backend.
+        (`winding_rates`), for the method "tree". Where the edges are of no use, it sums over the
+        triangles."""
+        winding = self._values_data(backend).winding
+        assert isinstance(winding, TreeWinding)  # for the type: the method is "tree"
+        return BoundaryRates.of(backend, self.mesh, self.order, winding)
 
-        data: the mesh on that backend.
-        winding: the tree over the mesh's triangles, which is used where the edges are of no use.
-        """
-        return self._rates.get_or_make(
-            data.backend, lambda: BoundaryRates.of(data.backend, self.mesh, self.order, winding)
-        )
-
-    def _stated(self, data: _WindingData, x: Vec3, values: PointValues) -> PointValues:
+    def _stated(self, data: WindingData, x: Vec3, values: PointValues) -> PointValues:
         """Complete results at points: enlarge their error bounds by two errors that are still
         missing, and convert results and bounds to the user's units. The first error is the jump of
         w at a triangle, if rounding hides on which side of the triangle x is. The second one
@@ -435,29 +455,34 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             data.size
         )
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> WindingEvaluator:
         """The object that samples w on a backend. If the surface of the plan's levels is the mesh
         itself (`is_whole_surface`), it takes the level only at the triangles.
 
         plan: what the evaluator will be used for. For many rays it has FMM cells.
         """
+        level_of_sheets, cells = None, self.cell_choice(plan.ray_count)
         if self.is_whole_surface(plan.levels):
-            field, level_of_sheets = self.with_cells(False), plan.levels[0]
-        else:
-            field, level_of_sheets = self.for_ray_count(plan.ray_count), None
-        return _WindingEvaluator(field, field.traced_data(backend), level_of_sheets)
+            level_of_sheets, cells = plan.levels[0], NO_CELLS
+        return WindingEvaluator(self, self.traced_data(backend, cells), cells, level_of_sheets)
 
-    def traced_data(self, backend: Backend, ray_count: int = 0) -> _WindingData:
-        """The mesh on a backend, for tracing; with FMM cells if they save time for this number of
-        rays."""
-        return self.for_ray_count(ray_count)._upload(backend, traced=True)
+    def traced_data(self, backend: Backend, cells: CellChoice) -> WindingData:
+        """The mesh on a backend, for tracing. cells: the FMM cells that it has."""
+        return self._upload(backend, traced=True, cells=cells)
+
+    def _values_data(self, backend: Backend) -> WindingData:
+        """The mesh on a backend, for values at points. It has FMM cells if the user requested those
+        of a soup."""
+        cells = self.cell_choice() if self._is_soup else NO_CELLS
+        return self._upload(backend, traced=False, cells=cells)
 
     @cached_upload
-    def _upload(self, backend: Backend, *, traced: bool) -> _WindingData:
+    def _upload(self, backend: Backend, *, traced: bool, cells: CellChoice) -> WindingData:
         """Copy the mesh to a backend, in unit coordinates.
 
         traced: True for tracing rays; False for values at points. It decides the default accuracy
-            of a tree, and whether FMM cells are built.
+            of a tree.
+        cells: the FMM cells that are added.
         """
         accuracy = self.accuracy or (_TRACING_ACCURACY if traced else _VALUES_ACCURACY)
         mesh = self.mesh
@@ -466,21 +491,22 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             winding = ExactWinding.of(backend, mesh, rays, traced)
         else:
             winding = TreeWinding.of(backend, mesh, accuracy, self.order)
-        data = _WindingData(*frame_parameters(backend, mesh.center, mesh.size), winding, rays)
-        if not self.cells or not len(mesh.singular_edges) or not (traced or self.cells_for_values):
+        data = WindingData(*frame_parameters(backend, mesh.center, mesh.size), winding, rays)
+        if not cells or not len(mesh.singular_edges):
             return data
-        return self._add_cells(data, traced=traced)
+        return self._add_cells(data, cells, traced=traced)
 
-    def _add_cells(self, data: _WindingData, *, traced: bool) -> _WindingData:
+    def _add_cells(self, data: WindingData, choice: CellChoice, *, traced: bool) -> WindingData:
         """Return `data` with FMM cells, or unchanged if they would take too much memory. For a soup
         (triangles that have few edges in common) these are cells of triangles. Otherwise, and if a
         soup's cells take too much memory, they are cells of singular edges, which are built for
         tracing only.
 
         data: the mesh on a backend.
+        choice: the choice of cells.
         traced: whether the data are for tracing rays, and not for values at points.
         """
-        mesh, most_bytes, winding = self.mesh, self.max_bytes(), data.winding
+        mesh, winding = self.mesh, data.winding
         extent = self.extent((self.default_level,))
         assert extent is not None  # for the type: there always is an extent
         low, high = extent.bounds()
@@ -488,14 +514,17 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             # Half the side of the cube around the origin of the unit coordinates that contains the
             # extent. The cells fill a cube of the whole side, enlarged by 0.1 % (`_CUBE_FACTOR`).
             reach = float(np.maximum(high - mesh.center, mesh.center - low).max()) / mesh.size
-            cells = self.build_cached(
-                data.backend, lambda: winding.build_cells(mesh, _CUBE_FACTOR * reach, most_bytes)
+            half = _CUBE_FACTOR * reach
+            cells = self.built_cells(
+                data.backend, choice, lambda: winding.build_cells(mesh, half, choice.max_bytes)
             )
             if cells is not None:
                 return dataclasses.replace(data, winding=dataclasses.replace(winding, cells=cells))
         if not traced:
             return data
-        cells = BoundaryCells.build(data.rays, mesh, low, high, most_bytes, self._center_values)
+        cells = BoundaryCells.build(
+            data.rays, mesh, low, high, choice.max_bytes, self._center_values
+        )
         return dataclasses.replace(data, cells=cells)
 
     @property
@@ -509,11 +538,17 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """w at the centers (n, 3) of FMM cells, and proved bounds (n,) of its error. For the exact
         method the sum is computed in double precision, at points that are many roundings of single
         precision off the triangles; so its rounding is far below the bound."""
-        field = self.with_cells(False)  # with cells, this would call itself
-        value = np.array(field.value(points, precision="double"))
-        if self.method == "exact":
-            return value, np.full(len(value), _EXACT_ERROR)
-        return value, field.error_bound(points, precision="double")
+        is_exact = self.method == "exact"
+
+        def kernel(backend: Backend, x: Vec3) -> tuple[Any, ...]:
+            """w at the Dr.Jit points x, without FMM cells; by a tree with a bound of its error."""
+            data = self._upload(backend, traced=False, cells=NO_CELLS)
+            values = self._values_from(data, x, 0, 1.0)
+            return (values.value,) if is_exact else (values.value, values.error)
+
+        value, *error = evaluate_points(points, kernel, "double")
+        value = np.array(value)
+        return value, np.full(len(value), _EXACT_ERROR) if is_exact else error[0]
 
     def cells_pay_from(self) -> float:
         """The smallest number of rays for which FMM cells save more time than it takes to build
@@ -526,18 +561,22 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         saves_time = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
         return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if saves_time else math.inf
 
-    def occupied_cells(self, levels: tuple[float, ...]) -> OccupancyGrid | None:
+    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
         """A grid over the extent, computed once for these levels. A cell is empty if w modulo 1 is
         proved to take none of the levels in it (`winding_cells`); rays then sample w there only
         where they cross triangles. None in three cases: the mesh has few singular edges; the
-        surface is the mesh itself; or the method is "tree" and there are no FMM cells."""
+        surface is the mesh itself; or the method is "tree" and there are no FMM cells for this
+        number of rays."""
+        cells = self.cell_choice(ray_count)
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
-        if is_small or self.is_whole_surface(levels) or (self.method != "exact" and not self.cells):
+        if is_small or self.is_whole_surface(levels) or (self.method != "exact" and not cells):
             return None
         extent = self.extent(levels)
         if extent is None:  # only for the type: there always is an extent
             return None
-        return self._occupied.get_or_make(levels, lambda: winding_cells(self, extent, levels))
+        return self._occupied.get_or_make(
+            (cells, levels), lambda: winding_cells(self, cells, extent, levels)
+        )
 
     def is_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the surface of these levels is the mesh itself, all triangles and nothing else,
@@ -558,9 +597,7 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
         """A volume that is proved to contain the level sets: all triangles, and the cells around
         them that are not proved empty (`winding_extent`). It is computed once for these levels, and
         is never None."""
-        return self._extents.get_or_make(
-            levels, lambda: winding_extent(self.with_cells(False), levels)
-        )
+        return self._extents.get_or_make(levels, lambda: winding_extent(self, levels))
 
     def describe(self) -> dict[str, Any]:
         """Facts about the field for users, as a dictionary of names and values: the numbers of
@@ -571,12 +608,12 @@ class WindingNumber(FieldWithCells, DeviceField["_WindingData"], BatchedField):
             "singular edges": len(mesh.singular_edges),
             "method": self.method,
             **({"corners joined by rounding": mesh.rounded} if mesh.rounded else {}),
-            **self.describe_cells(None if self._device is None else self._device.built),
+            **self.describe_cell_option(),
         }
 
 
-class _WindingEvaluator(Evaluator):
-    """The winding number w of a mesh, sampled on a backend.
+class WindingEvaluator(BatchedEvaluator):
+    """The evaluator of a winding number w.
 
     jumps: the triangles, across which w jumps.
     modulo_one: how w is sampled up to an unknown integer, by FMM cells of edges; None if there are
@@ -584,30 +621,30 @@ class _WindingEvaluator(Evaluator):
     """
 
     def __init__(
-        self, field: WindingNumber, data: _WindingData, level_of_sheets: float | None
+        self,
+        field: WindingNumber,
+        data: WindingData,
+        cells: CellChoice,
+        level_of_sheets: float | None,
     ) -> None:
-        """field: the winding number. data: the mesh on the backend. level_of_sheets: the level that
-        w takes at the triangles and nowhere else, if the mesh is the whole surface of this level
-        (`own_sheet`); otherwise None."""
-        self._field, self._data = field, data
-        self.jumps = _TriangleJumps(field, data, level_of_sheets)
+        """field: the winding number. data: the mesh on the backend. cells: the FMM cells that it
+        has. level_of_sheets: the level that w takes at the triangles and nowhere else, if the mesh
+        is the whole surface of this level (`own_sheet`); otherwise None."""
+        self.field, self.data, self._cells = field, data, cells
+        self.jumps = _TriangleJumps(field, data, cells, level_of_sheets)
         self.modulo_one = None if data.cells is None else _CellSamples(data)
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w itself at points p, jumps included: value, gradient, errors and proved
         bounds near p. The bounds hold for the smooth continuation of w through all triangles."""
-        data = self._data
+        data = self.data
         frame = data.upward_rays(p)
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
 
-    def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self._field.hessian(p)
-
-    def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        return self._field.derivative_errors(p, sample)
-
-    def differentiable_value(self, p: Vec3) -> Real:
-        return self._field.differentiable_value(p)
+    def describe(self) -> dict[str, Any]:
+        """The facts of `WindingNumber.describe`, with the number and the memory of the FMM cells
+        that were built."""
+        return self.field.describe() | self._cells.describe(self.data.built)
 
 
 # Capabilities of a winding number as objects (`fields.capabilities`).
@@ -618,14 +655,18 @@ class _TriangleJumps(Jumps):
 
     field: the winding number.
     data: the mesh on a backend, in unit coordinates.
+    cells: the FMM cells that it has.
     level: if the mesh is the whole surface (`own_sheet`), the level that w takes at the triangles
         and nowhere else; otherwise None.
     """
 
-    def __init__(self, field: WindingNumber, data: _WindingData, level: float | None) -> None:
-        """field: the winding number. data: the mesh on a backend. level: the level that w takes at
-        the triangles and nowhere else, if the mesh is the whole surface; otherwise None."""
-        self.field, self.data, self.level = field, data, level
+    def __init__(
+        self, field: WindingNumber, data: WindingData, cells: CellChoice, level: float | None
+    ) -> None:
+        """field: the winding number. data: the mesh on a backend. cells: the FMM cells that it has.
+        level: the level that w takes at the triangles and nowhere else, if the mesh is the whole
+        surface; otherwise None."""
+        self.field, self.data, self.cells, self.level = field, data, cells, level
         self.takes_all_levels = level is not None
 
     def next_crossing(
@@ -702,7 +743,7 @@ class _TriangleJumps(Jumps):
 
     def smooth_field(self) -> Field | None:
         """The winding number modulo 1, which is continuous across triangles; never None here."""
-        return WindingModuloOne(self.field)
+        return WindingModuloOne(self.field, self.cells)
 
     def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the surface of these levels is the mesh itself."""
@@ -715,7 +756,7 @@ class _CellSamples(ModuloOne):
     data: the mesh and its FMM cells of edges on a backend.
     """
 
-    def __init__(self, data: _WindingData) -> None:
+    def __init__(self, data: WindingData) -> None:
         """data: the mesh and its FMM cells of edges on a backend."""
         self.data = data
 
@@ -742,7 +783,7 @@ class _CellSamples(ModuloOne):
 
 
 @dataclass(frozen=True)
-class _WindingData(UnitFrame):
+class WindingData(UnitFrame):
     """The mesh of a winding number w on a backend, in unit coordinates.
 
     winding: the object that evaluates w, exactly or by a tree.
@@ -786,7 +827,7 @@ class _WindingData(UnitFrame):
 
 
 def _sample_at_start(
-    data: _WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
+    data: WindingData, frame: RayFrame, turns: Real, detail: Real, active: Mask = True
 ) -> Sample:
     """A sample of w at the origins of rays, on active lanes, in the user's units. It has proved
     bounds near the origins, but none along the rays.
@@ -818,7 +859,7 @@ class _WindingOnInterval(Evaluator):
 
     def __init__(
         self,
-        on: _WindingData,
+        on: WindingData,
         frame: RayFrame,
         behind: JumpCrossing,
         offset: Real,
@@ -830,20 +871,12 @@ class _WindingOnInterval(Evaluator):
         accurate."""
         self._on, self._frame, self._detail = on, frame, on.backend.Float(detail)
         self._behind, self._offset = behind, offset
-
-    @property
-    def variable_accuracy(self) -> VariableAccuracy | None:
-        """How the function is sampled with another accuracy; None if all samples are equally
-        accurate. If there are FMM cells of edges, coarse samples may give w only up to an unknown
-        integer."""
-        winding, has_cells = self._on.winding, self._on.cells is not None
-        if not (winding.has_detail or has_cells):
-            return None
-        return VariableAccuracy(self._at_accuracy, winding.coarsest_detail, has_cells)
-
-    def _at_accuracy(self, detail: Real) -> Evaluator:
-        """The same function with samples of the accuracy scale `detail`."""
-        return _WindingOnInterval(self._on, self._frame, self._behind, self._offset, detail)
+        has_cells = on.cells is not None
+        if on.winding.has_detail or has_cells:
+            # If there are FMM cells of edges, coarse samples may give w only up to an unknown
+            # integer.
+            at = functools.partial(_WindingOnInterval, on, frame, behind, offset)
+            self.variable_accuracy = VariableAccuracy(at, on.winding.coarsest_detail, has_cells)
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w at points p of the interval. On lanes on which it comes from an FMM cell of
