@@ -410,4 +410,12 @@ def cached_upload(upload: Upload) -> Upload:
             del uploads[next(iter(uploads))]
         return data
 
+    cast("Any", cached).is_cached_upload = True  # `keeps_uploads` asks for it
     return cast("Upload", cached)
+
+
+def keeps_uploads(field: Field) -> bool:
+    """Whether the data of a field on a backend are cached (`cached_upload`). Then they, and the
+    function, do not change unless an attribute of the field is set."""
+    upload = getattr(type(field), "_upload", None)
+    return hasattr(upload, "is_cached_upload") and not field.differentiable_parameters()

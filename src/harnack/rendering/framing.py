@@ -18,7 +18,7 @@ import numpy as np
 
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
 from harnack.fields import Solid
-from harnack.fields.batched_fields import FieldCache
+from harnack.fields.batched_fields import FieldCache, keeps_uploads
 from harnack.geometry.volume import as_point
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering.placed_surface import PlacedSurface, Placement
@@ -152,10 +152,9 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     """Find points (n, 3) of the surface that are seen from the six sides of the box in which it
     lies. Returns them in the surface's coordinates.
 
-    If preparing the field for tracing makes a new object, the points are cached for this object and
-    for the options of the surface. So no ray is traced for the framing if only the camera has
-    moved. If the field is traced as it is, without preparation, it may have been changed in place
-    since the last call, so the points are found anew.
+    If the field's data on a backend are cached, so are the points, for the options of the surface.
+    So no ray is traced for the framing if only the camera has moved. Another field may have been
+    changed in place since the last call, so the points are found anew.
 
     Raises:
         UnboundedSurfaceError: no box around the surface is known.
@@ -164,13 +163,12 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
     """
     ends = bounding_box(surface)
     check_drawable_size(ends)
-    prepared = surface.evaluator(backend)
 
     def find() -> FloatArray:
         """Find the points anew, without the cache."""
         return _find_visible_points(surface, backend, ends)
 
-    if prepared is surface.field:  # without preparation, it may have been changed in place
+    if not keeps_uploads(surface.field):  # it may have been changed in place
         return find()
     settings = (
         surface.level_values,
@@ -180,7 +178,7 @@ def visible_points(surface: TracedSurface, backend: Backend) -> FloatArray:
         surface.max_steps,
     )
     return _VISIBLE_POINTS_CACHE.get(
-        prepared, (*settings, surface.enclosures, surface.over_relaxation), find
+        surface.field, (*settings, surface.enclosures, surface.over_relaxation), find
     )
 
 

@@ -104,6 +104,8 @@ class Morph(BatchedField):
         else:
             # w is 0 or `gap`: the index is 0 for mesh a, 1 for mesh b.
             self._slice = WindingNumber(*meshes[int(w > 0)])
+        self.has_jumps = self._slice.has_jumps
+        self.has_variable_accuracy = self._slice.has_variable_accuracy
 
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
@@ -133,14 +135,6 @@ class Morph(BatchedField):
         return {**heights, "points of a": points[0], "points of b": points[1]}
 
     # At each height the function is that of the slice.
-
-    @property
-    def has_jumps(self) -> bool:
-        return self._slice.has_jumps
-
-    @property
-    def has_variable_accuracy(self) -> bool:
-        return self._slice.has_variable_accuracy
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         return self._slice.evaluator(backend, plan)

@@ -339,6 +339,7 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         self.method: Literal["sum", "tree"] = (
             ("sum" if is_small else "tree") if method == "auto" else method
         )
+        self.has_variable_accuracy = self.method == "tree"
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         # Half the longest side of the box; more for few points that stand for large areas.
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
@@ -424,11 +425,6 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         # Far away a tree sums fewer than 64 nodes; the direct sum always has all terms.
         terms = 64 if self.method == "tree" else len(self.points)
         return values.with_far_field_errors(x, max(terms, 64), weight).rescaled(data.size)
-
-    @property
-    def has_variable_accuracy(self) -> bool:
-        """Whether the field can be sampled with another accuracy; not if all points are summed."""
-        return self.method == "tree"
 
     def _ray_data(self, backend: Backend, plan: Plan) -> _ScreenedBuffers:
         del plan

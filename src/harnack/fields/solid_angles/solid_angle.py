@@ -189,6 +189,8 @@ class SolidAngle(FieldWithCells):
                 "cells are of curves that stay as they are, and a loop is a Dr.Jit array: give "
                 "NumPy arrays, or no cells"
             )
+        # Whether samples come from FMM cells whatever the number of rays.
+        self.has_variable_accuracy = bool(self._cell_choice(0))
 
     @property
     def loops(self) -> Loops:
@@ -263,11 +265,6 @@ class SolidAngle(FieldWithCells):
                 f"{did_you_mean(option, names)}"
             )
         return "edges" if option == "edges" else "range"
-
-    @property
-    def has_variable_accuracy(self) -> bool:
-        """Whether samples come from FMM cells whatever the number of rays."""
-        return bool(self._cell_choice(0))
 
     def _cell_choice(self, ray_count: int) -> CellChoice:
         """The FMM cells with which to trace `ray_count` rays. Circles alone have no cells."""
