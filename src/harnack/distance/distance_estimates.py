@@ -346,7 +346,7 @@ def _signed_lower_bound(backend: Backend, evaluator: Evaluator, levels: Levels, 
     return dr.copysign(level_distance_lower_bound(backend, evaluator, levels, p, sample), residual)
 
 
-_COMPUTE: dict[str, Callable[[Backend, Field, Levels, Vec3], Real]] = {
+_COMPUTE: dict[str, Callable[[Backend, Evaluator, Levels, Vec3], Real]] = {
     "first_order": _first_order,
     "second_order": _second_order,
     "lower_bound": _signed_lower_bound,

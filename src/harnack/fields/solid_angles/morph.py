@@ -106,6 +106,8 @@ class Morph(BatchedField):
             self._slice = WindingNumber(*meshes[int(w > 0)])
         self.has_jumps = self._slice.has_jumps
         self.has_variable_accuracy = self._slice.has_variable_accuracy
+        self.has_jumps = self._slice.has_jumps
+        self.has_variable_accuracy = self._slice.has_variable_accuracy
 
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None

@@ -876,7 +876,9 @@ class _WindingOnInterval(Evaluator):
             # If there are FMM cells of edges, coarse samples may give w only up to an unknown
             # integer.
             at = functools.partial(_WindingOnInterval, on, frame, behind, offset)
-            self.variable_accuracy = VariableAccuracy(at, on.winding.coarsest_detail, has_cells)
+            self.variable_accuracy: VariableAccuracy | None = VariableAccuracy(
+                at, on.winding.coarsest_detail, has_cells
+            )
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of w at points p of the interval. On lanes on which it comes from an FMM cell of
