@@ -136,11 +136,12 @@ def find(name: str) -> Any:
 
 def members_of(kind: type) -> Iterator[tuple[str, Any]]:
     """The public methods and properties that a class itself defines and documents."""
-    # `Field` sets its own `sample_ray` in classes that define `evaluate`: it is nothing of theirs.
+    # `Field` makes `evaluate` of `evaluator`, or the other way round: what is made is nothing of theirs.
     attributes: dict[str, Any] = {
         name: value
         for name, value in vars(kind).items()
         if not any(vars(base).get(name) is value for base in kind.__mro__[1:])
+        and not getattr(value, "is_derived", False)
     }
     if Parametrized in kind.__bases__:  # which has no entry of its own
         attributes = {**vars(Parametrized), **attributes}

@@ -181,7 +181,7 @@ class Step(hk.Field):
         known = (hk.proofs.Lipschitz(0.3),)
         return hk.fields.Sample(0.3 * p.z + side, type(p)(0.0, 0.0, 0.3), known)
 
-    has_jumps = True
+    traits = hk.fields.Traits(has_jumps=True)
 
     def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
         return hk.fields.SampleEvaluator(self, backend, jumps=PlaneJumps())
@@ -836,7 +836,7 @@ def test_a_field_must_say_how_far_its_sheets_are() -> None:
         distance = hk.fields.Jumps.distance
 
     class Silent(Step):
-        has_jumps = True
+        traits = hk.fields.Traits(has_jumps=True)
 
         def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
             return hk.fields.SampleEvaluator(self, backend, jumps=Quiet())

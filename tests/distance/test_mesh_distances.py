@@ -346,7 +346,7 @@ def test_meshes_with_holes(
     search = closest_point_search.search
 
     def counted(surface: Any, *given: Any) -> Any:
-        searched.append(surface.field.has_jumps)
+        searched.append(surface.field.traits.has_jumps)
         return search(surface, *given)
 
     monkeypatch.setattr(closest_point_search, "search", counted)

@@ -291,7 +291,7 @@ def test_check_field_sees_a_wrong_hessian(spoiled: Spoiled, message: str) -> Non
 class Creased(Spoiled):
     """Nothing says that it is smooth."""
 
-    has_creases = True
+    traits = hk.fields.Traits(has_creases=True)
 
     def evaluate(self, p: Any) -> hk.fields.Sample:
         return dataclasses.replace(super().evaluate(p), promises=(hk.proofs.Lipschitz(1.0),))

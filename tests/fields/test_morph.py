@@ -277,7 +277,7 @@ def test_many_first_hits(w: float) -> None:
 def test_ends_are_the_meshes(w: float, mesh: Any) -> None:
     o, d = rays(300, 7)
     field = morph(w)
-    assert field.has_jumps
+    assert field.traits.has_jumps
     found, wanted = hk.trace(field, o, d), hk.trace(hk.WindingNumber(*mesh), o, d)
     np.testing.assert_array_equal(found.is_hit, wanted.is_hit)
     np.testing.assert_array_equal(found.t, wanted.t)

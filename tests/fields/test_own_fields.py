@@ -277,7 +277,7 @@ class Rounded(Field):
 
     default_level = 0.3
     domain = hk.Ball(radius=2.0)
-    has_variable_accuracy = True
+    traits = hk.fields.Traits(has_variable_accuracy=True)
 
     def __init__(self, power: float) -> None:
         self.power = power

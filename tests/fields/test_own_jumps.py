@@ -65,7 +65,7 @@ class Step(Field):
     """|p| - 1, and `HEIGHT` more where x > 0."""
 
     domain = hk.Ball(radius=2.0)
-    has_jumps = True
+    traits = hk.fields.Traits(has_jumps=True)
 
     def __init__(self, plane: Jumps) -> None:
         self.plane = plane

@@ -425,7 +425,8 @@ def test_many_pictures_are_painted_with_cells() -> None:
         pictures = [one.answer(asked).pixels[..., :3].astype(int) for one in (session, plain)]
         state = session._painted
         assert state is not None
-        assert (state.drawn[0].surface.field.cells is True) == has_cells
+        surface = state.drawn[0].surface
+        assert bool(surface.field.cell_choice(surface.ray_count)) == has_cells
         assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 8).mean() < 5e-3
     assert np.ptp(pictures[0], axis=(0, 1)).max() > 50
     # Other controls begin anew.

@@ -224,8 +224,8 @@ def test_solids_know_the_waves_they_are_made_of():
          2 * math.pi),
         (hk.fields.FourierSeries(np.eye(4)[3].reshape(4, 1, 1), hk.Box((0, 0, 0), (3, 1, 1))), 2.0),
     ]:  # fmt: skip
-        assert part.min_wavelength == pytest.approx(expected, rel=1e-5)
-    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).min_wavelength is None
+        assert part.traits.min_wavelength == pytest.approx(expected, rel=1e-5)
+    assert (hk.Sphere(1.0) | hk.Torus(0.8, 0.3)).traits.min_wavelength is None
 
 
 def _volume(part: hk.solids.Solid, half: tuple[float, float, float], step: float) -> float:
@@ -253,7 +253,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
     in pieces, the wrong volume and all."""
     mesh = hk.mesh(part, tolerance=(2e-3 if bodies else 4e-3) * longest_side(part))
     assert mesh.is_watertight
-    assert mesh.metadata["harnack"]["spacing"] < part.min_wavelength / 4.999
+    assert mesh.metadata["harnack"]["spacing"] < part.traits.min_wavelength / 4.999
     assert mesh.volume == pytest.approx(
         _volume(part, half, half[2] / (400 if bodies else 150)), rel=2e-2 if bodies else 3e-2
     )

@@ -42,12 +42,12 @@ def test_writing_signatures_twice_changes_nothing() -> None:
 
 
 def test_members_are_those_that_a_class_defines() -> None:
-    """`Field` sets its `sample_ray` in classes that define `evaluate` and not it."""
+    """`Field` makes `evaluate` of `evaluator` in classes that define the latter alone."""
     members_of = generator().members_of
-    assert "sample_ray" in dict(members_of(hk.Field))
-    assert "sample_ray" in dict(members_of(hk.SolidAngle))
-    assert "sample_ray" in vars(hk.fields.Morph)
-    assert "sample_ray" not in dict(members_of(hk.fields.Morph))
+    assert "evaluate" in dict(members_of(hk.Field))
+    assert "evaluator" in dict(members_of(hk.fields.Morph))
+    assert "evaluate" in vars(hk.fields.Morph)
+    assert "evaluate" not in dict(members_of(hk.fields.Morph))
 
 
 def test_the_guide_has_every_name_at_the_top() -> None:

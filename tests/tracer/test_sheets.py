@@ -126,7 +126,7 @@ class BruteForceWinding(hk.Field):
     default_level = 0.5
     counts_crossings = False
 
-    has_jumps = True
+    traits = hk.fields.Traits(has_jumps=True)
 
     def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
         return hk.fields.SampleEvaluator(self, backend, jumps=BruteForceJumps(self))
@@ -545,7 +545,7 @@ def test_a_level_that_a_jump_cuts_off_is_within_reach_or_not(short: float, early
 class Staircase(hk.Field):
     """slope * x, and a jump at each of some planes x = const: all steps are known exactly."""
 
-    has_jumps = True
+    traits = hk.fields.Traits(has_jumps=True)
 
     def evaluator(self, backend: Any, plan: Any = None) -> hk.fields.SampleEvaluator:
         return hk.fields.SampleEvaluator(self, backend, jumps=StaircaseJumps(self))
@@ -759,7 +759,8 @@ def test_looks_see_the_error_of_the_slope_in_both_directions() -> None:
             )
 
     o, d = backend.Array3f(0, 0, 0), backend.Array3f(1, 0, 0)
-    look = Uncertain().sample_ray(RayPath(o, d, choose_enclosures(None)), real(0), real(1), real(1))
+    path = RayPath(o, d, choose_enclosures(None))
+    look = Uncertain().evaluator(backend).sample_ray(path, real(0), real(1), real(1))
     (ahead,), (back,) = look.forward, look.backward
     assert isinstance(ahead, TaylorEnclosure)
     assert isinstance(back, TaylorEnclosure)

@@ -38,7 +38,7 @@ def index_of(cells: OccupancyGrid, empty: bool) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(2))
 def test_empty_cells_are_off_the_level(seed: int) -> None:
     field = broken(seed=seed)
-    cells = field.occupied_cells((0.5,))
+    cells = field.occupied_cells_of(hk.fields.Plan((0.5,)))
     assert cells is not None
     rng = np.random.default_rng(seed)
     empty, rest = index_of(cells, empty=True), index_of(cells, empty=False)
@@ -97,7 +97,7 @@ def test_hits_are_those_without_cells() -> None:
     o = 4 * unit(rng.normal(size=(5000, 3)))
     d = unit(rng.uniform(-1, 1, (5000, 3)) * [1.0, 0.6, 1.4] - o)
     fast = hk.trace(field, o, d, precision="single", tolerance=1e-4)
-    field.occupied_cells = lambda levels, ray_count: None  # pyright: ignore[reportAttributeAccessIssue]
+    field.occupied_cells_of = lambda plan: None  # pyright: ignore[reportAttributeAccessIssue]
     plain = hk.trace(field, o, d, precision="single", tolerance=1e-4)
     assert (fast.status == plain.status).all()
     hit = plain.is_hit
@@ -114,12 +114,12 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 def test_a_moved_mesh_has_cells_of_its_own() -> None:
     field = broken(2)
-    one = field.occupied_cells((0.5,))
-    other = field.with_vertices(field.mesh.vertices * 2).occupied_cells((0.5,))
+    one = field.occupied_cells_of(hk.fields.Plan((0.5,)))
+    other = field.with_vertices(field.mesh.vertices * 2).occupied_cells_of(hk.fields.Plan((0.5,)))
     assert one is not None
     assert other is not None
     assert other.cell_size == pytest.approx(2 * one.cell_size, rel=1e-3)
-    assert field.occupied_cells((0.5,)) is one
+    assert field.occupied_cells_of(hk.fields.Plan((0.5,))) is one
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

@@ -341,7 +341,7 @@ class CellClassifier:
         self._volume = _domain(self.surface)
         self._has_hessian = has_hessian(self._backend, self._evaluator)
         self._clip_descent = None
-        if self._volume is not None and not self.surface.field.has_jumps:
+        if self._volume is not None and not self.surface.field.traits.has_jumps:
             volume = self._volume.upload(self._backend)
             self._clip_descent = ClipCurveDescent(
                 self._backend, self._evaluator, self._levels, volume
@@ -481,7 +481,7 @@ class CellClassifier:
             & (linear_error < FAR_SENTINEL * gradient_norm)
         )
         # A slab holds the surface only if a single level, without jumps, passes through the ball.
-        if len(self._levels.values) > 1 or self.surface.field.has_jumps:
+        if len(self._levels.values) > 1 or self.surface.field.traits.has_jumps:
             is_slab &= False
         elif self._levels.period is not None:
             # f - level changes by at most |g| radius + error in the ball, so that no other level
@@ -510,7 +510,7 @@ class CellClassifier:
         and an upper bound of the curvature of the surface at the point.
         """
         radius, unknown = radii.x, self._backend.Float(FAR_SENTINEL)
-        if self.surface.field.has_jumps:
+        if self.surface.field.traits.has_jumps:
             # No plane is known to approximate the surface: the radius is 0.
             return self._nearest_ray_hit(p, radius), normal, self._backend.Float(0), unknown
         point = self._newton_point(p, radius)

@@ -240,7 +240,7 @@ def _search_in_batches(
     max_cells = _max_cells(surface, len(points), tolerance.prove)
     cells_per_point = _CELLS_PER_PROOF if tolerance.prove else _CELLS_PER_POINT
     min_cells = min(max(_MIN_CELLS, int(cells_per_point * len(points))), _MAX_CELLS, max_cells)
-    if surface.field.has_jumps:
+    if surface.field.traits.has_jumps:
         min_cells = _MIN_JUMP_CELLS
     # The cells depend on the surface and the number of queries alone, so all batches share them.
     coarse, cells = _split(classifier, root, min_cells, progress)
@@ -271,10 +271,12 @@ def _search_in_batches(
 def _max_cells(surface: TracedSurface, count: int, is_proved: bool) -> int:
     """Return the largest number of cells into which space is divided for a search of `count`
     queries. is_proved: whether lower bounds are to be made as large as possible."""
-    if surface.field.has_jumps:
+    if surface.field.traits.has_jumps:
         return _MAX_JUMP_CELLS
     limit = min(max(_MAX_CELLS, count // 2), _MAX_PROOF_CELLS) if is_proved else _MAX_CELLS
-    return int(limit * (_EXPENSIVE_FIELD_FACTOR if surface.field.has_variable_accuracy else 1.0))
+    return int(
+        limit * (_EXPENSIVE_FIELD_FACTOR if surface.field.traits.has_variable_accuracy else 1.0)
+    )
 
 
 def _split(
@@ -374,7 +376,7 @@ class _CellSearch:
         called with a message before each stage."""
         if not len(self.points):
             return SearchResult(self.closest, self.lower)
-        has_jumps = self.classifier.surface.field.has_jumps
+        has_jumps = self.classifier.surface.field.traits.has_jumps
         if self.trees is not None:
             self._search_cells(*self.trees, has_jumps, progress)
         else:
@@ -514,7 +516,7 @@ class _CellSearch:
         """Whether an evaluation of the field takes longer than a walk through a tree of cells. Then
         even the first descent starts in a fine cell, near the closest point, to save evaluations.
         """
-        return self.classifier.surface.field.has_variable_accuracy
+        return self.classifier.surface.field.traits.has_variable_accuracy
 
     def _is_unproved(self) -> BoolArray:
         """Return the mask (n,) of queries for which a point may exist that is nearer than the best
@@ -569,7 +571,7 @@ class _CellSearch:
             improved_ids = self._descend_from_candidates(rows, starts)
             # Queries without a further chance are left out of the next round.
             active = np.isin(rows, improved_ids)
-            if self._is_expensive or self.classifier.surface.field.has_jumps:
+            if self._is_expensive or self.classifier.surface.field.traits.has_jumps:
                 # Those that had a start. (A missing one is at `FAR_SENTINEL`.)
                 active |= starts[0][:, 0] < 0.5 * FAR_SENTINEL
             # Only the last of the points tried before is kept, with those of this round.

@@ -158,7 +158,7 @@ def _find_sorted(
     x, guess, residual, lower, estimate = query.evaluate(points)
     if triangles is not None:
         guess = _with_mesh_points(x, guess, triangles)
-    if surface.field.has_jumps:
+    if surface.field.traits.has_jumps:
         guess = query.with_jump_points(x, guess)
     tolerance = StoppingRule(_TOLERANCE * _size(surface, x), is_proved)
     # Off the facets of a mesh without a clip, f differs from a smooth function by constants.
@@ -171,7 +171,7 @@ def _find_sorted(
             query, smooth, x, InitialGuess(guess, estimate), tolerance, progress
         )
     result.closest = _with_singular_points(surface, x, query.remove_truncation(x, result.closest))
-    if not surface.field.has_jumps:
+    if not surface.field.traits.has_jumps:
         proved = np.maximum(lower, result.lower_bounds)
         result.closest = _with_gradient_feet(
             query, x, result.closest, estimate, proved + tolerance.length
@@ -609,7 +609,7 @@ class _Query:
             this radius about the closest point, no point of the surface is nearer to the query; 0
             if that is not proved.
         """
-        if self.surface.field.has_jumps:
+        if self.surface.field.traits.has_jumps:
 
             def by_compass_search(p: Vec3, start: Vec3) -> tuple[Vec3]:
                 return (compass_search(self._tracer, p, start),)

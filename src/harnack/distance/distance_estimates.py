@@ -119,7 +119,7 @@ def signed_distance(
     x, result = in_batches(backend, estimate, points)
     if method == "lower_bound":
         _check_domain(field, x)
-    if field.has_jumps and method != "lower_bound":
+    if field.traits.has_jumps and method != "lower_bound":
         # These methods do not see facets: the nearest one of the surface is searched for. (The
         # lambda shows no progress.)
         jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
@@ -233,7 +233,7 @@ def _find(
     Raises NotImplementedError for a clip or section of a field with jumps.
     """
     if surface.clip_volume is not None:
-        if surface.field.has_jumps:
+        if surface.field.traits.has_jumps:
             raise NotImplementedError(
                 f"{name} takes no clip and no section of "
                 f"{with_article(type(surface.field).__name__)}, which jumps: cut its mesh "
@@ -273,7 +273,7 @@ def _surface(
     closely = TraceOptions(tolerance=_RAY_TOLERANCE, over_relaxation=1.0)
     traced = TracedSurface.of(target, closely).with_call_cache()
     backend = choose_backend(choices.precision or "double")
-    jumps = traced.evaluator(backend).jumps if field.has_jumps else None
+    jumps = traced.evaluator(backend).jumps if field.traits.has_jumps else None
     if jumps is not None and not jumps.gives_distances:
         raise NotImplementedError(
             f"{type(field).__name__} has jumps but does not say how far they are: define the "

@@ -23,7 +23,7 @@ from .capabilities import (
     VariableAccuracy,
 )
 from .expressions import expression
-from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator
+from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator, Traits
 from .formula import Formula
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
@@ -73,6 +73,7 @@ __all__ = [
     "Solid",
     "SolidAngle",
     "SphericalHarmonic",
+    "Traits",
     "VariableAccuracy",
     "WaveProduct",
     "WindingNumber",

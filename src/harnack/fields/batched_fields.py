@@ -24,7 +24,7 @@ from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.fields.batch_evaluation import evaluate_points
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, SampleEvaluator
+from harnack.fields.field import Field, SampleEvaluator, Traits
 from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ class SourceSum(BatchedField):
     at any accuracy (`SumData`). There may be two sums, one for tracing rays, and one for values at
     large numbers of points (`values_at`). Subclasses define `_ray_data`."""
 
-    has_variable_accuracy = True
+    traits = Traits(has_variable_accuracy=True)
 
     @abc.abstractmethod
     def _ray_data(self, backend: Backend, plan: Plan) -> SumData:
@@ -266,7 +266,7 @@ class SumEvaluator(BatchedEvaluator):
 
     def __init__(self, field: SourceSum, data: SumData) -> None:
         self.field, self.data = field, data
-        if field.has_variable_accuracy:
+        if field.traits.has_variable_accuracy:
             at = functools.partial(_SumAtAccuracy, field, data)
             self.variable_accuracy = VariableAccuracy(at, data.coarsest_accuracy)
 

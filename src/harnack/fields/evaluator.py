@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
     from harnack.enclosures.samples import Ray, RaySample, Sample
     from harnack.fields.capabilities import Jumps, ModuloOne, Patches, VariableAccuracy
+    from harnack.tree.empty_space import OccupancyGrid
 
 __all__ = ["EvaluateOnly", "Evaluator", "Plan"]
 
@@ -131,6 +132,18 @@ class Evaluator(abc.ABC):
         infinite, which is the default, if none is known. With it, meshing proves that a mesh has
         the topology of the surface."""
         return 0 * p.x + radius + dr.inf
+
+    def occupied_cells(self) -> OccupancyGrid | None:
+        """A grid of cells, in which some cells are marked as occupied. All other cells are proved
+        to contain no point of the level sets of the levels of the plan. None if no such grid is
+        known.
+
+        The default is None. Searches for first hits skip the cells that are not occupied. This
+        saves time for fields that are expensive to evaluate. If f jumps across facets, there is a
+        second condition: in a cell that is not occupied, f continued smoothly across the facets
+        takes no level either.
+        """
+        return None
 
     def differentiable_value(self, p: Vec3) -> Real:
         """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the field's

@@ -14,6 +14,7 @@ import copy
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.fields.capabilities import Boundary, Jumps, ModuloOne, Patches, VariableAccuracy
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupancyGrid
 
 
 __all__ = [
@@ -60,6 +60,7 @@ __all__ = [
     "Sample",
     "SampleEvaluator",
     "TaylorRemainder",
+    "Traits",
     "space_scaled",
 ]
 
@@ -77,6 +78,37 @@ _SOLID_METHODS = frozenset(
         "blended",
     )
 )
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What the functions of the library have to know of a field before it is sampled.
+
+    over_relaxation: the over-relaxation factor with which tracing needs the fewest evaluations, by
+        experiment; at least 1. The tracer tries steps longer than the proved length by this factor,
+        and proves the rest afterwards, looking back from the new point.
+    min_wavelength: the shortest wavelength of f that matters; None if it is not known. Code that
+        samples f in cells makes the cells smaller than this.
+    is_cheap: whether a sample costs less than fetching the next ray from a queue
+        (`tracer.surface_tracer.trace_queued`), by measurement.
+    is_global: whether f and its promises hold in all of space. `Field.domain` then only limits what
+        is drawn.
+    has_creases: whether the gradient may jump, as it does where the surfaces of a union meet.
+    has_jumps: whether f jumps across facets. Then `Evaluator.jumps` is an object.
+    has_patches: whether the surface is a union of patches, each a level set of a function of its
+        own. Then `Evaluator.patches` is an object.
+    has_variable_accuracy: whether f is sampled with different accuracy whatever the number of rays.
+        Then `Evaluator.variable_accuracy` is an object.
+    """
+
+    over_relaxation: float = 1.4
+    min_wavelength: float | None = None
+    is_cheap: bool = False
+    is_global: bool = False
+    has_creases: bool = False
+    has_jumps: bool = False
+    has_patches: bool = False
+    has_variable_accuracy: bool = False
 
 
 class Field(Parametrized, abc.ABC):
@@ -102,41 +134,14 @@ class Field(Parametrized, abc.ABC):
     """Whether f is larger inside of its surfaces than outside, as a winding number is. Then the
     inside is where f > level; else it is where f < level, as for signed distances."""
 
-    over_relaxation: float = 1.4
-    """The over-relaxation factor with which tracing needs the fewest evaluations, by experiment; at
-    least 1. The tracer tries steps longer than the proved length by this factor, and proves the
-    rest afterwards, looking back from the new point."""
-
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.
     Rays are clipped to it, and samples need only be right at points p in it. As it is convex, a
     ray from p stays in it up to where it is clipped. So `Lipschitz` and `TaylorRemainder` promises
     need not hold outside of it."""
 
-    is_global: bool = False
-    """Whether f and its promises hold in all of space. `domain` then only limits what is drawn."""
-
-    min_wavelength: float | None = None
-    """The shortest wavelength of f that matters; None if it is not known. Code that samples f in
-    cells makes the cells smaller than this."""
-
-    is_cheap: bool = False
-    """Whether a sample costs less than fetching the next ray from a queue
-    (`tracer.surface_tracer.trace_queued`), by measurement."""
-
-    has_creases: bool = False
-    """Whether the gradient may jump, as it does where the surfaces of a union meet."""
-
-    has_jumps: bool = False
-    """Whether f jumps across facets. Then `Evaluator.jumps` is an object."""
-
-    has_patches: bool = False
-    """Whether the surface is a union of patches, each a level set of a function of its own. Then
-    `Evaluator.patches` is an object."""
-
-    has_variable_accuracy: bool = False
-    """Whether f can be sampled with different accuracy. Then `Evaluator.variable_accuracy` is an
-    object."""
+    traits: Traits = Traits()
+    """What the functions of the library have to know of f before it is sampled."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Make a field, which remembers this call (`parameters`).
@@ -147,13 +152,13 @@ class Field(Parametrized, abc.ABC):
             TypeError: the class defines neither `evaluate` nor `evaluator`; or an argument `domain`
                 that is neither a volume nor None.
         """
+        if not cls.has_parameter_derivatives:
+            check_no_derivatives(cls.__name__, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
                 "returns a harnack.fields.Sample"
             )
-        if not cls.has_parameter_derivatives:
-            check_no_derivatives(cls.__name__, args, kwargs)
         field = super().__new__(cls)
         record_call(field, args, kwargs)
         return field
@@ -276,20 +281,6 @@ class Field(Parametrized, abc.ABC):
         """
         del levels
         return self.domain
-
-    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
-        """A grid of cells, in which some cells are marked as occupied. All other cells are proved
-        to contain no point of the level sets of these levels. None if no such grid is known.
-
-        ray_count: the number of rays that will be traced; 0 if it is not known (`Plan.ray_count`).
-
-        The default is None. Searches for first hits skip the cells that are not occupied. This
-        saves time for fields that are expensive to evaluate. If f jumps across facets, there is a
-        second condition: in a cell that is not occupied, f continued smoothly across the facets
-        takes no level either.
-        """
-        del levels, ray_count
-        return None
 
     def operands(self) -> tuple[Field, ...]:
         """The fields of which this one is combined: at each point its function is that of one of

@@ -38,7 +38,7 @@ from harnack.enclosures.parabola import ConvexityEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, refuse_hidden_parameters
+from harnack.fields.field import Field, Traits, refuse_hidden_parameters
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -97,9 +97,9 @@ class Formula(Field):
     """
 
     is_convex: bool = False
-    is_cheap = True
-    has_creases = True  # it may use abs, maximum and minimum
-    over_relaxation = 1.0  # proved steps are long already; trying longer ones takes more samples
+    # It may use abs, maximum and minimum. Proved steps are long already; trying longer ones takes
+    # more samples.
+    traits = Traits(is_cheap=True, has_creases=True, over_relaxation=1.0)
     lipschitz: Real | None = None
     literals: ClassVar[tuple[str, ...]] = ()
 

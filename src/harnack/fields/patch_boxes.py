@@ -13,7 +13,7 @@ import numpy as np
 
 from harnack.fields.capabilities import PatchEntry, Patches
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field
+from harnack.fields.field import Field, Traits
 from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single
 from harnack.geometry import Box
 from harnack.tree.closest_triangles import BoxTree
@@ -91,7 +91,7 @@ class PatchField(Field):
     """
 
     no_single_function: ClassVar[str]
-    has_patches = True
+    traits = Traits(has_patches=True)
 
     @abc.abstractmethod
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:

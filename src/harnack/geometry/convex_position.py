@@ -310,6 +310,11 @@ class ConvexHull(Polytope):
         """The lower and the upper corner (3,) of a box around the polytope."""
         return np.array(self.lower), np.array(self.upper)
 
+    def with_planes(self, count: int) -> ConvexHull:
+        """The larger polytope that is bounded by the first `count` planes and by the box."""
+        planes = slice(count)
+        return ConvexHull(self.normals[planes], self.offsets[planes], self.lower, self.upper)
+
     def padded(self, distance: float) -> ConvexHull:
         """The polytope with all planes moved outwards by `distance`, so that it contains every
         point within that distance."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -361,9 +360,9 @@ class Session:
 
         rays: the number of rays of the next picture.
 
-        The surfaces of the last call are returned again if the controls are the same. But once ten
-        times as many rays were traced as they were prepared for, the surfaces are prepared again:
-        then building cells may take less time than it saves. Cells hold local expansions of the
+        The surfaces of the last call are returned again if the controls are the same. But once twice
+        as many rays were traced as they were prepared for, the surfaces are prepared again: then
+        building cells may take less time than it saves. Cells hold local expansions of the
         field, which make each ray faster.
         """
         # Arrays are compared by their bytes.
@@ -373,8 +372,8 @@ class Session:
         if state is None or state.key != key:
             state = self._painted = _PreviewCache(key, self.live.surfaces_at(controls))
         state.rays += rays
-        # Powers of ten: so surfaces are seldom prepared again.
-        rays = 10 ** int(math.log10(max(state.rays, 1)))
+        # Powers of two: so surfaces are seldom prepared again.
+        rays = 1 << (state.rays - 1).bit_length()
         if not state.prepared or rays != state.prepared_rays:
             state.prepared_rays = rays
             state.drawn = [

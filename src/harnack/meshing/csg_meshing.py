@@ -150,7 +150,7 @@ class CsgMesher:
     tolerance: a length, the largest distance of midpoints of edges and centers of faces from the
         surface.
     spacing: the largest size of cells.
-    per_wave: the smallest number of cells along a wave (`Field.min_wavelength`); None for no such
+    per_wave: the smallest number of cells along a wave (`Traits.min_wavelength`); None for no such
         limit.
     mesh_angle: meshes a level set of a `SolidAngle`; the mesh ends at the field's boundary curve.
     most_faces: the largest number of triangles of each level set.
@@ -335,8 +335,8 @@ class CsgMesher:
         size = float((upper - lower).max())
         # At least eight cells along the longest side.
         spacing = min(self.spacing, size / 8)
-        if self.per_wave is not None and field.min_wavelength is not None:
-            spacing = min(spacing, field.min_wavelength / self.per_wave)
+        if self.per_wave is not None and field.traits.min_wavelength is not None:
+            spacing = min(spacing, field.traits.min_wavelength / self.per_wave)
         self.smallest_cell = min(self.smallest_cell, spacing)
         function = self.function(_underlying_field(field), level)
         self.report(f"level {level:g} of {type(field).__name__} in cells of {spacing:.3g}")
@@ -621,7 +621,7 @@ class _DomainExtendedFunction(LevelFunction):
             MeshingError: points lie outside of a domain that is neither a box nor a ball.
         """
         domain = self.field.domain
-        if domain is None or self.field.is_global:
+        if domain is None or self.field.traits.is_global:
             return points
         if isinstance(domain, Box):
             return np.clip(points, *domain.bounds())

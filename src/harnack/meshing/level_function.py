@@ -33,7 +33,7 @@ MOST_FACES = 2_000_000
 """The largest number of triangles of a level set, unless another is chosen."""
 
 CELLS_PER_WAVE = 5.0
-"""The smallest number of cells along a wave (`Field.min_wavelength`), unless a spacing is given."""
+"""The smallest number of cells along a wave (`Traits.min_wavelength`), without a given spacing."""
 
 _PROOFS = choose_enclosures("curvature")
 

@@ -139,7 +139,7 @@ def mesh(
         of a closed mesh.
     cell_size: the size of cells before refinement, in the field's unit. None chooses a 24th of the
         longest side of the box (a 48th for meshing by signs), and at most a fifth of the length of
-        waves (`Field.min_wavelength`). Sheets that are nearer to each other are told apart where
+        waves (`Traits.min_wavelength`). Sheets that are nearer to each other are told apart where
         that is noticed; otherwise a MeshingError says so.
     thickness: makes a closed part with this thickness of a surface, in the field's unit: half of it
         on each side.
@@ -420,7 +420,7 @@ def _mesh_from_signs(
             solid_so_far = to_manifold(signed(ends[0], -1.0, True))
         if math.isfinite(ends[1]):
             solid_so_far = solid_so_far - to_manifold(signed(ends[1], -1.0, True))
-        if field.has_jumps and len(levels) == 2:
+        if field.traits.has_jumps and len(levels) == 2:
             _check_has_thickness(field, solid_so_far, ends, mesh_options.tolerance.at(size))
         cut_volume = volume or Box(tuple(box.lower.tolist()), tuple(box.upper.tolist()))
         solid_so_far ^= volume_manifold(
@@ -459,7 +459,7 @@ def _ends_by_signs(
         TypeError: the level set is to be thickened, but f jumps across it.
         ValueError: the field has no such level.
     """
-    if is_thick and field.has_jumps:
+    if is_thick and field.traits.has_jumps:
         raise TypeError(
             f"{type(field).__name__} jumps, and its surface has no normals to thicken it "
             "along: mesh it, and move the mesh's vertices instead"
@@ -655,7 +655,7 @@ def _checked(field: Field) -> Field:
             `SolidAngle`.
     """
     check_is_field(field)
-    if field.has_patches or (field.has_jumps and not uses_sign_meshing(field)):
+    if field.traits.has_patches or (field.traits.has_jumps and not uses_sign_meshing(field)):
         raise TypeError(
             f"{type(field).__name__} is not one continuous function: mesh its parts, or the "
             "solid angle of its boundary"
@@ -777,8 +777,8 @@ def _mesh_level_set(field: Field, level: float | None, mesh_options: _MeshOption
     cell_size = (
         size / _CELLS_ACROSS if mesh_options.spacing is None else float(mesh_options.spacing)
     )
-    if mesh_options.spacing is None and field.min_wavelength is not None:
-        cell_size = min(cell_size, field.min_wavelength / CELLS_PER_WAVE)
+    if mesh_options.spacing is None and field.traits.min_wavelength is not None:
+        cell_size = min(cell_size, field.traits.min_wavelength / CELLS_PER_WAVE)
     attempts = 1 if mesh_options.spacing is not None else _MAX_ATTEMPTS
     if isinstance(field, SolidAngle):
         triangles, facts = _mesh_spanning_curve(

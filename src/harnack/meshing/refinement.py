@@ -119,7 +119,7 @@ def refine(
         # The midpoints of the edges that are split become new vertices.
         samples, max_step = marks.samples.select(is_split), 0.5 * marks.span[is_split]
         moved = newton_to_level(function, marks.middle[is_split], samples, max_step, walls)
-        if function.field.has_creases:
+        if function.field.traits.has_creases:
             moved = _project_to_creases(function, vertices, marks.ends[is_split], moved, walls)
         new_vertex = np.full(len(is_split), -1, np.int64)
         new_vertex[is_split] = len(vertices) + np.arange(int(is_split.sum()))
@@ -132,7 +132,7 @@ def refine(
         )
         smaller_faces = split_faces(vertices, faces[~is_fan], new_vertex[marks.edges[~is_fan]])
         faces = np.concatenate([smaller_faces, fan_faces(faces[is_fan], fan_centers)])
-    if function.field.has_variable_accuracy:
+    if function.field.traits.has_variable_accuracy:
         vertices = _converge_vertices(function, vertices, faces, tolerance, walls)
     return vertices, faces
 
@@ -392,7 +392,7 @@ class _RefinementMarks:
         misses_corner = np.zeros(len(faces), np.bool_)
         # Faces whose center is far although no midpoint of their edges is.
         center_only_rows = np.flatnonzero(must_split & ~marked[edges].any(axis=1))
-        if function.field.has_creases:
+        if function.field.traits.has_creases:
             misses_corner[center_only_rows] = _normals_turn(
                 function, vertices[faces[center_only_rows]]
             )

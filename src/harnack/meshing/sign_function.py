@@ -164,7 +164,7 @@ class SignFunction(LevelFunction):
         gradients are set to 0, since they tell nothing about the distance to the level set. Radii
         (`quarter_period_radius`) are 0."""
         no_radius = np.zeros(len(points))
-        if self.field.has_jumps:
+        if self.field.traits.has_jumps:
             return LevelSamples(self.values(points), np.zeros((len(points), 3)), no_radius)
         self.evaluations += len(points)
         if isinstance(self.field, BatchedField):
@@ -227,7 +227,7 @@ class SignFunction(LevelFunction):
         direction = high - low
         t = np.zeros(len(low))
         normal, is_on_jump = np.zeros_like(low), np.zeros(len(low), np.bool_)
-        if self.field.has_jumps:
+        if self.field.traits.has_jumps:
             # Halve the segments until few facets are left on them, and then intersect them with
             # these. Segments that meet none have a root.
             first, last = self._bisect(low, direction)
@@ -253,7 +253,7 @@ class SignFunction(LevelFunction):
         if not len(x):
             return x
         self.evaluations += len(x)
-        if isinstance(self.field, BatchedField) and not self.field.has_jumps:
+        if isinstance(self.field, BatchedField) and not self.field.traits.has_jumps:
             # [1]: the gradient.
             field_gradient = self.field.rough_value_and_gradient(x, precision=self.precision)[1]
         else:

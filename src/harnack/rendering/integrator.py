@@ -8,7 +8,7 @@ All light paths advance together, one vertex at a time, and the rays of a vertex
 queue: a lane that has finished a ray takes the next one. In a recorded loop over whole paths, each
 packet of lanes would wait for its slowest ray at each vertex, and three quarters of the lanes were
 idle. Paths that have ended are left out after each vertex. Fields whose samples take less time than
-taking a ray from the queue are traced without it (`Field.is_cheap`). The queue only changes the
+taking a ray from the queue are traced without it (`Traits.is_cheap`). The queue only changes the
 order of lanes, not the results. Intermediate results are written to memory, so that kernels do not
 depend on the number of paths that are left.
 

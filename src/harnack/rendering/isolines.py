@@ -66,7 +66,7 @@ def as_field(function: Any, name: str = "color_by") -> Field:
         except ValueError as error:  # the name may end with a comma, which suits other messages
             raise ValueError(f"{name.rstrip(',')}: {error}") from None
     if isinstance(function, Field):
-        if function.has_patches:
+        if function.traits.has_patches:
             raise ValueError(
                 f"{name} must be one function on space, and this {type(function).__name__} has one "
                 "for each part"
@@ -86,7 +86,7 @@ def padded_domain(function: Field, size: float) -> Volume | None:
 
     size: the length of the surface on which the function is evaluated; the margin is 1e-5 of it.
     """
-    if function.domain is None or function.is_global:
+    if function.domain is None or function.traits.is_global:
         return None
     return function.domain.padded(_PADDING * size)
 

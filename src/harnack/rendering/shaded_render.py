@@ -96,12 +96,12 @@ def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
         ValueError: the surface consists of level sets of several functions, or its field jumps.
     """
     surface, backend = proxy.surface, mitsuba_backend(mi)
-    if surface.field.has_patches:
+    if surface.field.traits.has_patches:
         raise ValueError(
             f'antialias="cones" takes a level set of one function, and {surface.field!r} has one '
             'for each part. Leave antialias at "edges"'
         )
-    if surface.field.has_jumps:
+    if surface.field.traits.has_jumps:
         raise ValueError(
             f'antialias="cones" takes fields without jumps, and {surface.field!r} jumps: its '
             'values tell no distance. Leave antialias at "edges"'

@@ -302,7 +302,7 @@ def build_studio(
         if surface.tolerance is None:
             # The default tolerance is a length on the stage; the surface needs it in its own
             # coordinates.
-            length = _PATCH_TOLERANCE if surface.field.has_patches else _TOLERANCE
+            length = _PATCH_TOLERANCE if surface.field.traits.has_patches else _TOLERANCE
             surface = replace(surface, tolerance=HitTolerance(length / placement.scale))
         bsdf = element.material.bsdf(
             solid=surface.solid_range is not None, traced_light=traced_light

@@ -172,7 +172,7 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
         (field.default_level,),
         tolerance=surface.tolerance,
         max_steps=surface.max_steps,
-        over_relaxation=field.over_relaxation,
+        over_relaxation=field.traits.over_relaxation,
     )
 
 

@@ -84,7 +84,7 @@ def check_derivatives(field: Field, points: FloatArray, look: FieldSamples) -> N
     try:
         _check_hessian(field, points, look, trials)
     except BrokenPromiseError:
-        if not field.has_variable_accuracy:
+        if not field.traits.has_variable_accuracy:
             raise
         # The Hessian may be the derivative of the exact gradient, without truncation error.
         exact_trials = [_without_truncation(field, points, entry) for entry in trials]
@@ -265,7 +265,9 @@ def _check_gradient(
     # The difference with the smaller of the two spacings.
     error = np.linalg.norm(_difference(stencil)[0] - samples.gradient, axis=1)
     message = "the gradient is not that of the value"
-    _require_agreement(error, tolerance, allowance, message, points, has_creases=field.has_creases)
+    _require_agreement(
+        error, tolerance, allowance, message, points, has_creases=field.traits.has_creases
+    )
 
 
 def _difference(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray]:
@@ -507,4 +509,4 @@ def _check_hessian(
 
     agreement = _best_agreement([compare(stencil) for stencil in trials])
     message = "the Hessian is not the derivative of the gradient"
-    _require_agreement(*agreement, message, points, has_creases=field.has_creases)
+    _require_agreement(*agreement, message, points, has_creases=field.traits.has_creases)

@@ -260,7 +260,7 @@ def _overrides_sample_ray(field: Field) -> bool:
     and not from its promises (proved bounds near a point) as other fields do. Fields with jumps do
     not count."""
     kind = type(field.evaluator(choose_backend("double")))
-    return kind.sample_ray is not Evaluator.sample_ray and not field.has_jumps
+    return kind.sample_ray is not Evaluator.sample_ray and not field.traits.has_jumps
 
 
 def _check_numbers(field: Field, points: FloatArray, samples: FieldSamples) -> None:

@@ -187,7 +187,7 @@ def accumulated_jumps(
     of a ray. The points are start + t direction for each t of `lengths` (n, m). The field's method
     `Jumps.next_crossing` reports the jumps one after the other."""
     total = np.zeros_like(lengths)
-    if not field.has_jumps:
+    if not field.traits.has_jumps:
         return total
     backend = choose_backend("double")
     jumps = field.evaluator(backend).jumps
@@ -422,7 +422,7 @@ class _ViolationSearch:
         """Whether the change of f between two points has to be followed along a path between them,
         because f jumps or is known modulo a period only. Otherwise it is the difference of the
         values."""
-        return self.field.period is not None or self.field.has_jumps
+        return self.field.period is not None or self.field.traits.has_jumps
 
     def pairs(self, p: FloatArray, w: FloatArray, samples: int = _PATH_SAMPLES) -> _Candidates:
         """Evaluate pairs of points: make the pairs of p (n, 3) and y = p + reach * w, where reach

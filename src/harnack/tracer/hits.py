@@ -161,7 +161,7 @@ def trace(
     Dr.Jit, too, and the results of the device must agree.
 
     On CPUs, if there are at least 4,096 rays and successive rays differ much, rays are traced by
-    few lanes that share a queue, unless evaluations of f are cheap (`Field.is_cheap`). This gives
+    few lanes that share a queue, unless evaluations of f are cheap (`Traits.is_cheap`). This gives
     the same hits, bit by bit, in about half the time. If only the `largest` component is traced, a
     ray is out of steps if it starts so far away that its coordinates are rounded by more than a
     small part of a cell.
@@ -200,7 +200,7 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
     prepared = surface.for_rays(count).tracer(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
-    if not prepared.field.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
+    if not prepared.field.traits.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
         prepared = replace(prepared, uses_ray_queue=True)
     # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():

@@ -145,7 +145,7 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
     c away from a set, the given point is at least c minus the distance between the two away from
     it.
     """
-    domain = None if field.is_global else field.domain
+    domain = None if field.traits.is_global else field.domain
     backend = choose_backend("double")
     prepared = None if domain is None else domain.upload(backend)
 

@@ -104,12 +104,12 @@ class Surface:
         for name, value in values.items():
             object.__setattr__(self, name, value)  # the dataclass is frozen
         field.validate_levels(self.level_values)
-        if field.has_jumps and field.period is not None:
+        if field.traits.has_jumps and field.period is not None:
             raise ValueError("a field with jumps must be real-valued: its period must be None")
-        if self.largest and (field.has_jumps or field.has_patches):
+        if self.largest and (field.traits.has_jumps or field.traits.has_patches):
             raise ValueError(
                 f"largest=... needs one continuous function, and this {type(field).__name__} "
-                f"{'jumps' if field.has_jumps else 'has one for each patch'}"
+                f"{'jumps' if field.traits.has_jumps else 'has one for each patch'}"
             )
 
     def replace(self, **changes: Any) -> Surface:

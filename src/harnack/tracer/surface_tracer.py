@@ -405,7 +405,7 @@ class SurfaceTracer:
             unchanged if f has jumps, or if it has no creases, as then it is good enough.
         active: mask of rays with a crossing.
         """
-        if self.evaluator.jumps is not None or not self.field.has_creases:
+        if self.evaluator.jumps is not None or not self.field.traits.has_creases:
             return (
                 contact.root,
                 contact.gradient,
@@ -567,6 +567,6 @@ class SurfaceTracer:
                 return PatchTracer(to_end, self.evaluator.patches, path, start, end, any_hit)
             return SmoothTracer(to_end, self.evaluator, path, end)
 
-        if self.uses_ray_queue and march.hysteresis is None and not self.field.is_cheap:
+        if self.uses_ray_queue and march.hysteresis is None and not self.field.traits.is_cheap:
             return trace_queued(tracer, path, start, end, state, collect)
         return collect(*tracer(path, start, end).run(state))

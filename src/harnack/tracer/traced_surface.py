@@ -20,6 +20,7 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
 from harnack.fields.evaluator import Plan
+from harnack.geometry import ConvexHull
 from harnack.name_suggestions import with_article
 from harnack.tracer.largest_component import largest_component_cells
 from harnack.tracer.level_contact import HitTolerance
@@ -47,6 +48,8 @@ _T = TypeVar("_T")
 _INTEGER_MARGIN = 1e-3
 # The default tolerance, as a fraction of the longest side of the box; and for unbounded surfaces.
 _RELATIVE_TOLERANCE, _UNBOUNDED_TOLERANCE = 1e-4, 1e-4
+# From this number of rays on, extents have at most this number of planes.
+_MANY_RAYS, _MAX_PLANES = 1_000_000, 48
 
 _FIRST_HITS_ONLY = (
     "largest=... works for first hits alone: it cannot be combined with crossings, "
@@ -126,7 +129,7 @@ class TracedSurface:
         """
         over_relaxation, default_over_relaxation = (
             options.over_relaxation,
-            surface.field.over_relaxation,
+            surface.field.traits.over_relaxation,
         )
         return cls(
             surface.field,
@@ -166,12 +169,12 @@ class TracedSurface:
                 one level at once.
             NotImplementedError: the field is a union of patches, each with a function of its own.
         """
-        if self.field.has_patches:
+        if self.field.traits.has_patches:
             raise NotImplementedError(
                 f"{option} takes one function, and this {type(self.field).__name__} has one for "
                 "each patch: trace a patch by itself, such as mesh.face(0) of a polygon mesh"
             )
-        if self.field.has_jumps and len(self.levels) > 1:
+        if self.field.traits.has_jumps and len(self.levels) > 1:
             raise ValueError(
                 f"{option} takes one level of a field with jumps, such as this "
                 f"{type(self.field).__name__}, not {len(self.levels)}: trace each level by itself"
@@ -214,8 +217,13 @@ class TracedSurface:
 
     @property
     def extent(self) -> Volume | None:
-        """The volume in which the level sets are proved to lie; None if none is known."""
-        return self.memoize("extent", lambda: self.field.extent(self.level_values))
+        """The volume in which the level sets are proved to lie; None if none is known. For many
+        rays a polytope has only some of its planes: with hundreds, clipping rays takes longer than
+        the march of a field with cells."""
+        extent = self.memoize("extent", lambda: self.field.extent(self.level_values))
+        if self.ray_count >= _MANY_RAYS and isinstance(extent, ConvexHull):
+            return extent.with_planes(_MAX_PLANES)
+        return extent
 
     @property
     def volume(self) -> Volume | None:
@@ -239,7 +247,22 @@ class TracedSurface:
         parameters = self.field.differentiable_parameters()
         has_derivatives = any(map(dr.grad_enabled, parameters))
         key, plan = ("evaluator", backend, self.ray_count, has_derivatives), self.plan
-        return self.memoize(key, lambda: self.field.evaluator(backend, plan))
+        return self.memoize(key, lambda: self._checked(self.field.evaluator(backend, plan)))
+
+    def _checked(self, evaluator: Evaluator) -> Evaluator:
+        """Return an evaluator of the field. Raises TypeError if it has jumps or patches and the
+        traits of the field say that it has none, or the other way round."""
+        traits = self.field.traits
+        for name, is_stated, capability in (
+            ("jumps", traits.has_jumps, evaluator.jumps),
+            ("patches", traits.has_patches, evaluator.patches),
+        ):
+            if is_stated != (capability is not None):
+                raise TypeError(
+                    f"the traits of {type(self.field).__name__} say has_{name}={is_stated}, and "
+                    f"its evaluator has {'no ' if is_stated else ''}{name}"
+                )
+        return evaluator
 
     @property
     def plan(self) -> Plan:
@@ -254,15 +277,17 @@ class TracedSurface:
         )
         return Levels(levels, self.field.period)
 
-    def _occupied(self) -> OccupancyGrid | None:
+    def _occupied(self, evaluator: Evaluator) -> OccupancyGrid | None:
         """Return the grid of cells with a mark on those that may contain a level of the surface;
         None if no cells are known. If only the largest component is traced, only its cells are
-        marked."""
+        marked.
+
+        evaluator: the field's evaluator for these levels and this number of rays.
+        """
         # `largest` is a number of cells, 0 for all components. Results are kept for this field,
         # these levels and a key; the key has what else they depend on.
         if not self.largest:
-            key, arguments = ("cells", self.ray_count), (self.level_values, self.ray_count)
-            return self.memoize(key, lambda: self.field.occupied_cells(*arguments))
+            return self.memoize(("cells", self.ray_count), evaluator.occupied_cells)
         volume = intersection_of([self.field.domain, self.extent, self.clip])
         key = "largest", self.clip, self.side, self.largest
         return self.memoize(
@@ -297,11 +322,12 @@ class TracedSurface:
             raise ValueError(_FIRST_HITS_ONLY)
         volume, region = self.volume, None
         self._check_size(backend)
-        occupied = self._occupied() if self.largest or (many_rays and not crosses) else None
+        evaluator, known_volume = self.evaluator(backend), None
+        needs_cells = self.largest or (many_rays and not crosses)
+        occupied = self._occupied(evaluator) if needs_cells else None
         # Rays that look for crossings start a little outside the extent, but inside `region`.
         if crosses or self.require_crossing:
             region = intersection_of([self.field.domain, self.clip, self.section])
-        evaluator, known_volume = self.evaluator(backend), None
         # No level may be nearly an integer.
         if evaluator.modulo_one is not None and all(
             abs(math.remainder(level, 1)) > _INTEGER_MARGIN for level in self.level_values
@@ -361,12 +387,12 @@ def check_has_inside(surface: TracedSurface) -> None:
         return
     if field.period is not None:
         raise ValueError("an angle-valued field has no inside: side needs a real-valued one")
-    if field.has_patches:
+    if field.traits.has_patches:
         raise ValueError(
             f"{with_article(type(field).__name__)} is many surfaces and no closed solid: draw it "
             "without side"
         )
-    if field.has_jumps:
+    if field.traits.has_jumps:
         raise ValueError(
             "a field that jumps has no closed solid: values on one side may end at a facet, with "
             "no level there; draw its level set without side"

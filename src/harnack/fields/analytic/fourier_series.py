@@ -6,6 +6,7 @@ only to measure by how much the series differs from it."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import operator
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_
 from harnack.fields.analytic.waves import mean_wavelength
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample, validate_levels_in_range
+from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
 from harnack.geometry.clip_volumes import Box
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class FourierSeries(Field):
             without size.
     """
 
-    over_relaxation = 1.5
+    traits = Traits(over_relaxation=1.5)
 
     fit_error: float | None = None
     """The largest sampled difference of values between series and function; None for a series made
@@ -114,9 +115,8 @@ class FourierSeries(Field):
         self._size = upper - self._lower
         self._bounds = CosineBounds.of(checked, self._size)
         wave_vectors = np.indices(checked.shape).reshape(3, -1)[:, 1:].T * (math.pi / self._size)
-        self.min_wavelength = mean_wavelength(
-            checked.ravel()[1:], np.linalg.norm(wave_vectors, axis=1)
-        )
+        min_wavelength = mean_wavelength(checked.ravel()[1:], np.linalg.norm(wave_vectors, axis=1))
+        self.traits = dataclasses.replace(self.traits, min_wavelength=min_wavelength)
         self._rounding = _rounding(checked, self._size)
         self._source: Function | FloatArray | None = None
 

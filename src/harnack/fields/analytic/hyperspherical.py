@@ -40,7 +40,7 @@ from harnack.fields.analytic.sphere_bounds import (
     value_bound,
 )
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, validate_levels_in_range
+from harnack.fields.field import Field, Traits, validate_levels_in_range
 from harnack.fields.parameters import record_call
 from harnack.geometry.clip_volumes import Ball
 
@@ -165,9 +165,7 @@ class HypersphericalHarmonic(Field):
         TypeError: l, j or m is no integer.
     """
 
-    is_cheap = True
-    over_relaxation = 1.6
-    is_global = True
+    traits = Traits(is_cheap=True, over_relaxation=1.6, is_global=True)
     _coefficients: Monomials  # of `from_polynomial` only
 
     def __init__(self, l: int, j: int, m: int, *, domain: Volume | None = None) -> None:  # noqa: E741

@@ -29,7 +29,7 @@ from harnack.fields.analytic.solid_harmonics import (
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample
+from harnack.fields.field import Field, Sample, Traits
 from harnack.fields.parameters import record_call
 from harnack.geometry.clip_volumes import Ball
 from harnack.name_suggestions import is_one_of
@@ -91,7 +91,7 @@ class Lobes(Field):
         TypeError: l or m is no integer.
     """
 
-    over_relaxation = 1.6
+    traits = Traits(over_relaxation=1.6)
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, sign: LobeSign = "both") -> None:  # noqa: E741
         """Set up the lobes of a single spherical harmonic, Y_lm. The class describes the arguments

@@ -12,6 +12,7 @@ is Gillespie, Yang, Botsch and Crane 2024.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Iterable
@@ -39,7 +40,7 @@ from harnack.fields.analytic.waves import (
     sine_factor,
 )
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample, validate_levels_in_range
+from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -243,15 +244,15 @@ class EigenfunctionSum(Field):
         ValueError: terms that are not finite, or a sum that is constant.
     """
 
-    is_global = True
-    is_cheap = True
+    traits = Traits(is_global=True, is_cheap=True)
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         """Check the terms, and compute their bounds and the default domain."""
         self.terms = checked_terms(terms)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)
-        self.min_wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
+        min_wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
+        self.traits = dataclasses.replace(self.traits, min_wavelength=min_wavelength)
         self.domain = Ball(radius=longest) if domain is None else domain
         self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)

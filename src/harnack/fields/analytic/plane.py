@@ -41,7 +41,7 @@ from harnack.fields.analytic.branches import (
     derivatives,
 )
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field
+from harnack.fields.field import Field, Traits
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
 from harnack.geometry.clip_volumes import Box, VolumeIntersection
 from harnack.name_suggestions import did_you_mean
@@ -330,7 +330,7 @@ class LevelCurves(Field):
         TypeError, ValueError: an invalid function, or a function with several branches.
     """
 
-    is_global = True
+    traits = Traits(is_global=True)
 
     def __init__(
         self,

@@ -43,7 +43,7 @@ from harnack.fields.analytic.sphere_bounds import (
     value_bound,
 )
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample, validate_levels_in_range
+from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -283,8 +283,7 @@ class _SolidHarmonics(Field):
     each times a coefficient) of the point p/size, for |p| <= size. Its bounds near points are those
     of `HarmonicPromises`."""
 
-    is_cheap = True
-    over_relaxation = 1.6
+    traits = Traits(is_cheap=True, over_relaxation=1.6)
 
     def __init__(
         self, weights: Weights, known: BallRange, size: float, domain: Volume, axis: int = 2

@@ -9,6 +9,7 @@ each branch stands for all its shifts by whole periods."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_of, derivatives
 from harnack.fields.analytic.plane import copied_arguments, make_branches
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field
+from harnack.fields.field import Field, Traits
 from harnack.geometry.clip_volumes import Ball, Box, VolumeIntersection
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ class RiemannSurface(Field):
             missing; or the function is invalid.
     """
 
-    is_global = True
+    traits = Traits(is_global=True)
 
     def __init__(
         self,
@@ -198,7 +199,7 @@ class RiemannSurface(Field):
         shift = self.branches.period(part == "imag")
         self._shift = None if shift is None else abs(self.height) * shift
         self._is_single = self.branches.count == 1
-        self.has_creases = not self._is_single
+        self.traits = dataclasses.replace(self.traits, has_creases=not self._is_single)
         if self._is_single:
             self.period = self._shift  # pyright: ignore[reportAttributeAccessIssue]
 

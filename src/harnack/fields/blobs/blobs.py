@@ -10,6 +10,7 @@ Waals radii.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ class Blobs(Formula):
         BlobError: numbers that are not valid blobs (a ValueError).
     """
 
-    is_cheap = False
+    traits = dataclasses.replace(Formula.traits, is_cheap=False)
     default_level: float = 1.0
     is_larger_inside = True
     period: ClassVar[float | None] = None

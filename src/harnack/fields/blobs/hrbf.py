@@ -8,6 +8,7 @@ the values and the derivatives of a function."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -76,7 +77,7 @@ class HRBF(Formula):
         ValueError: arguments that are not points with normals, or a repeated point.
     """
 
-    is_cheap = False
+    traits = dataclasses.replace(Formula.traits, is_cheap=False)
     period: ClassVar[float | None] = None
     default_level: float = 0.0
 

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.geometry import Volume
-    from harnack.tree.empty_space import OccupancyGrid
 
 
 class Morph(BatchedField):
@@ -104,10 +103,7 @@ class Morph(BatchedField):
         else:
             # w is 0 or `gap`: the index is 0 for mesh a, 1 for mesh b.
             self._slice = WindingNumber(*meshes[int(w > 0)])
-        self.has_jumps = self._slice.has_jumps
-        self.has_variable_accuracy = self._slice.has_variable_accuracy
-        self.has_jumps = self._slice.has_jumps
-        self.has_variable_accuracy = self._slice.has_variable_accuracy
+        self.traits = self._slice.traits
 
     def quadrature_displacement(
         self, points: Any, *, precision: Precision | None = None
@@ -149,9 +145,6 @@ class Morph(BatchedField):
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         return self._slice.extent(levels)
-
-    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
-        return self._slice.occupied_cells(levels, ray_count)
 
 
 def _checked(mesh: Any, name: str) -> tuple[FloatArray, IntArray]:

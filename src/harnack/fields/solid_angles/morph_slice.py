@@ -28,8 +28,9 @@ from harnack.backend.elementary import fmax
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch_evaluation import evaluate_points
-from harnack.fields.batched_fields import SourceSum, cached_upload
+from harnack.fields.batched_fields import SourceSum, SumData, SumEvaluator, cached_upload
 from harnack.fields.clearance import occupied_cells, tight_extent
+from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.field import Sample
 from harnack.fmm.point_values import PointValues
 from harnack.fmm.radial_kernel import (
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, FloatArray, IntArray, Precision, Real, Vec3
-    from harnack.fields.evaluator import Plan
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
 
@@ -561,14 +561,27 @@ class MorphSlice(SourceSum):
             )
         return self._extents[levels]
 
-    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> SumEvaluator:
+        return _MorphSliceEvaluator(self, self._ray_data(backend, plan), plan.levels)
+
+    def occupied_cells_of(self, levels: tuple[float, ...]) -> OccupancyGrid:
         """Compute, once, the cells of a grid over the extent that may contain a point of a level
-        set. The other cells are proved to contain none; rays skip them. They are the same for any
-        number of rays."""
-        del ray_count
+        set. The other cells are proved to contain none; rays skip them."""
         return self._occupied.get_or_make(
             levels, lambda: occupied_cells(self, levels, self.extent(levels), _CELLS_ACROSS)
         )
+
+
+class _MorphSliceEvaluator(SumEvaluator):
+    """The evaluator of a `MorphSlice`."""
+
+    def __init__(self, field: MorphSlice, data: SumData, levels: tuple[float, ...]) -> None:
+        """levels: the levels whose level sets are traced; () for none."""
+        super().__init__(field, data)
+        self._slice, self._levels = field, levels
+
+    def occupied_cells(self) -> OccupancyGrid | None:
+        return self._slice.occupied_cells_of(self._levels) if self._levels else None
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import Evaluator
+from harnack.fields.field import Traits
 from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fmm.curve_queries import lift_ball, remainder_promises
@@ -477,7 +478,7 @@ class PolygonMesh(PatchField):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    over_relaxation: float = 1.3  # as for `SolidAngle`
+    traits = Traits(has_patches=True, over_relaxation=1.3)  # as for `SolidAngle`
     no_single_function = (
         "a polygon mesh is no level set of one function, but of one for each face: ask a "
         "face, such as mesh.face(0), which is a harnack.SolidAngle"

@@ -339,7 +339,8 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         self.method: Literal["sum", "tree"] = (
             ("sum" if is_small else "tree") if method == "auto" else method
         )
-        self.has_variable_accuracy = self.method == "tree"
+        has_variable_accuracy = self.method == "tree"
+        self.traits = dataclasses.replace(self.traits, has_variable_accuracy=has_variable_accuracy)
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         # Half the longest side of the box; more for few points that stand for large areas.
         extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))

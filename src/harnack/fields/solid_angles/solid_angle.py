@@ -31,7 +31,7 @@ from harnack.fields.batched_fields import cached_upload
 from harnack.fields.capabilities import Boundary, VariableAccuracy
 from harnack.fields.clearance import tight_extent
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Ray, RaySample, Sample, space_scaled
+from harnack.fields.field import Ray, RaySample, Sample, Traits, space_scaled
 from harnack.fields.solid_angles.cell_options import NO_CELLS, CellChoice, FieldWithCells
 from harnack.fields.solid_angles.planar import PlanarRegion, planar_region
 from harnack.fmm.circle_sums import CircleSet, CircleSums
@@ -142,7 +142,7 @@ class SolidAngle(FieldWithCells):
 
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
-    over_relaxation: float = 1.3  # by experiment
+    traits = Traits(over_relaxation=1.3)  # by experiment
     has_parameter_derivatives: ClassVar[bool] = True
 
     def __init__(
@@ -190,7 +190,8 @@ class SolidAngle(FieldWithCells):
                 "NumPy arrays, or no cells"
             )
         # Whether samples come from FMM cells whatever the number of rays.
-        self.has_variable_accuracy = bool(self._cell_choice(0))
+        has_cells = bool(self._cell_choice(0))
+        self.traits = dataclasses.replace(self.traits, has_variable_accuracy=has_cells)
 
     @property
     def loops(self) -> Loops:
@@ -466,14 +467,9 @@ class SolidAngle(FieldWithCells):
         # way. No number is farther than 2 pi from all multiples of 4 pi: if `nearest` is 2 pi, all
         # levels are 2 pi modulo 4 pi.
         is_in_hull = self.convex_position and nearest > 2 * math.pi * (1 - 1e-9)
-        if is_in_hull and self._cell_choice(
-            0
-        ):  # some half-spaces of the hull: all of it lies in them
-            hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
-            planes = slice(_MAX_PLANES)
-            return ConvexHull(hull.normals[planes], hull.offsets[planes], hull.lower, hull.upper)
         if is_in_hull and not self._differentiable_loops:
-            return ConvexHull.from_points(points).padded(1e-4 * self._size)
+            hull = ConvexHull.from_points(points).padded(1e-4 * self._size)
+            return hull.with_planes(_MAX_PLANES) if self._cell_choice(0) else hull
         length = sum(circle.length for circle in self._net_circles)
         length += total_length(self._net_loops) if self._net_loops else 0.0
         # The bound rho of `extent`, a little larger for rounding.

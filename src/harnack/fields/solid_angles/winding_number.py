@@ -48,7 +48,7 @@ from harnack.fields.capabilities import (
 )
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
-from harnack.fields.field import Field, Sample, space_scaled
+from harnack.fields.field import Field, Sample, Traits, space_scaled
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import (
     NO_CELLS,
@@ -97,7 +97,7 @@ class WindingModuloOne(Field):
     """
 
     period: ClassVar[float | None] = 1.0
-    has_variable_accuracy = True
+    traits = Traits(has_variable_accuracy=True)
 
     def __init__(self, winding: WindingNumber, cells: CellChoice | None = None) -> None:
         """winding: the winding number w. cells: the FMM cells from which samples come; None if the
@@ -286,7 +286,7 @@ class WindingNumber(FieldWithCells, BatchedField):
     period: ClassVar[float | None] = None
     default_level: float = 0.5
     is_larger_inside = True
-    has_jumps = True
+    traits = Traits(has_jumps=True)
 
     def __init__(
         self,
@@ -464,7 +464,8 @@ class WindingNumber(FieldWithCells, BatchedField):
         level_of_sheets, cells = None, self.cell_choice(plan.ray_count)
         if self.is_whole_surface(plan.levels):
             level_of_sheets, cells = plan.levels[0], NO_CELLS
-        return WindingEvaluator(self, self.traced_data(backend, cells), cells, level_of_sheets)
+        data = self.traced_data(backend, cells)
+        return WindingEvaluator(self, data, cells, level_of_sheets, plan)
 
     def traced_data(self, backend: Backend, cells: CellChoice) -> WindingData:
         """The mesh on a backend, for tracing. cells: the FMM cells that it has."""
@@ -561,13 +562,13 @@ class WindingNumber(FieldWithCells, BatchedField):
         saves_time = _MIN_CELL_EDGES <= edges <= _MAX_CELL_EDGES
         return max(_MIN_RAYS, _PAYS_PER_EDGE * edges) if saves_time else math.inf
 
-    def occupied_cells(self, levels: tuple[float, ...], ray_count: int = 0) -> OccupancyGrid | None:
-        """A grid over the extent, computed once for these levels. A cell is empty if w modulo 1 is
-        proved to take none of the levels in it (`winding_cells`); rays then sample w there only
-        where they cross triangles. None in three cases: the mesh has few singular edges; the
-        surface is the mesh itself; or the method is "tree" and there are no FMM cells for this
+    def occupied_cells_of(self, plan: Plan) -> OccupancyGrid | None:
+        """A grid over the extent, computed once for the levels of a plan. A cell is empty if w
+        modulo 1 is proved to take none of the levels in it (`winding_cells`); rays then sample w
+        there only where they cross triangles. None in three cases: the mesh has few singular edges;
+        the surface is the mesh itself; or the method is "tree" and there are no FMM cells for this
         number of rays."""
-        cells = self.cell_choice(ray_count)
+        cells, levels = self.cell_choice(plan.ray_count), plan.levels
         is_small = len(self.mesh.singular_edges) < _MIN_CELL_EDGES
         if is_small or self.is_whole_surface(levels) or (self.method != "exact" and not cells):
             return None
@@ -626,11 +627,13 @@ class WindingEvaluator(BatchedEvaluator):
         data: WindingData,
         cells: CellChoice,
         level_of_sheets: float | None,
+        plan: Plan,
     ) -> None:
         """field: the winding number. data: the mesh on the backend. cells: the FMM cells that it
         has. level_of_sheets: the level that w takes at the triangles and nowhere else, if the mesh
-        is the whole surface of this level (`own_sheet`); otherwise None."""
-        self.field, self.data, self._cells = field, data, cells
+        is the whole surface of this level (`own_sheet`); otherwise None. plan: what the evaluator
+        will be used for."""
+        self.field, self.data, self._cells, self._plan = field, data, cells, plan
         self.jumps = _TriangleJumps(field, data, cells, level_of_sheets)
         self.modulo_one = None if data.cells is None else _CellSamples(data)
 
@@ -640,6 +643,9 @@ class WindingEvaluator(BatchedEvaluator):
         data = self.data
         frame = data.upward_rays(p)
         return _sample_at_start(data, frame, data.winding.crossings_ahead(frame, 0, True), 1.0)
+
+    def occupied_cells(self) -> OccupancyGrid | None:
+        return self.field.occupied_cells_of(self._plan)
 
     def describe(self) -> dict[str, Any]:
         """The facts of `WindingNumber.describe`, with the number and the memory of the FMM cells

@@ -8,6 +8,7 @@ it."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Callable, Iterable
@@ -124,10 +125,13 @@ class BooleanSolid(Solid):
         # The smallest factor of all operands. A step longer than the proved one is accepted only if
         # every operand proves the rest of it, looking back from the new point. So one operand
         # without such proofs makes longer steps useless.
-        object.__setattr__(
-            self, "over_relaxation", min(part.over_relaxation for part in self.parts)
+        traits = dataclasses.replace(
+            self.traits,
+            over_relaxation=min(part.traits.over_relaxation for part in self.parts),
+            min_wavelength=min_wavelength(self.parts),
+            has_variable_accuracy=any(part.traits.has_variable_accuracy for part in self.parts),
         )
-        object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
+        object.__setattr__(self, "traits", traits)
         constants = [part.lipschitz for part in self.parts]
         # The minimum or maximum of functions has the largest of their constants.
         all_known = all(part is not None for part in constants)
@@ -159,10 +163,6 @@ class BooleanSolid(Solid):
         if len(bounded) < len(extents):
             return None
         return _box_around_volumes(bounded)
-
-    @property
-    def has_variable_accuracy(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return any(part.has_variable_accuracy for part in self.parts)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return _extremum([part.formula(x, y, z) for part in self.parts], is_union=self.is_union)
@@ -412,11 +412,10 @@ class BooleanSolidEvaluator(Evaluator):
 
 
 def min_wavelength(parts: Iterable[Solid]) -> float | None:
-    """The smallest `Field.min_wavelength` of the solids `parts`. Solids for which it is None are
+    """The smallest `Traits.min_wavelength` of the solids `parts`. Solids for which it is None are
     left out; None if no solid remains."""
-    return min(
-        (part.min_wavelength for part in parts if part.min_wavelength is not None), default=None
-    )
+    wavelengths = (part.traits.min_wavelength for part in parts)
+    return min((length for length in wavelengths if length is not None), default=None)
 
 
 def lipschitz_of(sample: Sample) -> Lipschitz | None:
@@ -594,7 +593,7 @@ class BlendedSolid(FormulaSolid):
     solids grown by the radius.
     """
 
-    is_cheap = False
+    traits = dataclasses.replace(FormulaSolid.traits, is_cheap=False)
     literals = ("power",)  # the ranges of x^p depend on the kind of number that p is
 
     parts: tuple[Solid, Solid]
@@ -624,7 +623,8 @@ class BlendedSolid(FormulaSolid):
         # The constant of the blend of two functions, with a margin for rounding.
         lipschitz = 2 ** (1 / self.power) * max(constants) * (1 + 1e-6) if all_known else None
         object.__setattr__(self, "lipschitz", lipschitz)
-        object.__setattr__(self, "min_wavelength", min_wavelength(self.parts))
+        traits = dataclasses.replace(self.traits, min_wavelength=min_wavelength(self.parts))
+        object.__setattr__(self, "traits", traits)
         object.__setattr__(self, "domain", union(*self.parts).domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:

@@ -7,6 +7,7 @@ are, relative to the distance of the points."""
 from __future__ import annotations
 
 import abc
+import dataclasses
 import math
 import numbers
 from dataclasses import dataclass
@@ -60,7 +61,7 @@ class Deformation(SpaceMap):
     @property
     def min_scale(self) -> float:
         """The smallest factor by which the map multiplies lengths, and so the wavelengths of a
-        solid's function. It is an estimate, for `Field.min_wavelength`.
+        solid's function. It is an estimate, for `Traits.min_wavelength`.
 
         The default is 1. It is also used for maps whose factors have no positive lower bound: a
         twist compresses waves the more, the farther they are from its axis.
@@ -83,7 +84,7 @@ class Deformation(SpaceMap):
         that ball."""
 
     @abc.abstractmethod
-    def prepare(self, backend: Backend) -> Deformation:
+    def on_backend(self, backend: Backend) -> Deformation:
         """The same map with its numbers as kernel parameters of the backend (numbers that a
         compiled kernel reads when it runs)."""
 
@@ -109,10 +110,10 @@ class DeformedSolid(FormulaSolid):
         if self.inner.domain is not None:
             domain = self.map.volume(self.inner.domain)
             object.__setattr__(self, "domain", domain)
-        wavelength = self.inner.min_wavelength
-        object.__setattr__(
-            self, "min_wavelength", None if wavelength is None else wavelength * self.map.min_scale
-        )
+        if (wavelength := self.inner.traits.min_wavelength) is not None:
+            wavelength = wavelength * self.map.min_scale
+            traits = dataclasses.replace(self.traits, min_wavelength=wavelength)
+            object.__setattr__(self, "traits", traits)
 
     @property
     def may_jump(self) -> bool:
@@ -126,11 +127,11 @@ class DeformedSolid(FormulaSolid):
         return self.inner.formula(*self.map.preimage(x, y, z))
 
     def formula_on(self, backend: Backend) -> FormulaFunction:
-        return _DeformedFormula(self.inner.formula_on(backend), self.map.prepare(backend))
+        return _DeformedFormula(self.inner.formula_on(backend), self.map.on_backend(backend))
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
         del plan
-        inner, change = self.inner.evaluator(backend), self.map.prepare(backend)
+        inner, change = self.inner.evaluator(backend), self.map.on_backend(backend)
         # The constant of the inner solid; on the backend, if it is a formula.
         constant = inner.lipschitz if isinstance(inner, FormulaEvaluator) else self.inner.lipschitz
         formula = _DeformedFormula(formula_of(inner), change)
@@ -223,7 +224,7 @@ class Twist(Deformation):
         # At the rate 0, m is NaN.
         return dr.select(rate > 0, constant, 1), dr.select(rate > 0, radius, dr.inf)
 
-    def prepare(self, backend: Backend) -> Twist:
+    def on_backend(self, backend: Backend) -> Twist:
         return with_device_numbers(self, backend)
 
 
@@ -318,7 +319,7 @@ class Taper(Deformation):
         root = dr.sqrt(fmax(total * total - 4 * k * k, 0))
         return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius
 
-    def prepare(self, backend: Backend) -> Taper:
+    def on_backend(self, backend: Backend) -> Taper:
         return with_device_numbers(self, backend)
 
 

@@ -155,7 +155,7 @@ class Extrusion(Solid):
         outline = OutlineEdges.upload(backend, self.loops)
         half = dr.opaque(backend.Float, 0.5 * self.height)
         twist, taper = (
-            None if deform is None else deform.prepare(backend)
+            None if deform is None else deform.on_backend(backend)
             for deform in (cast("Any", self)._turning, cast("Any", self)._tapering)
         )
         return _ExtrusionData(outline, half, twist, taper)

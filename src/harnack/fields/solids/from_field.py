@@ -79,7 +79,7 @@ def solid(
     if len(bounds) != 1:
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
-    if field.has_jumps:
+    if field.traits.has_jumps:
         raise ValueError(
             f"{type(field).__name__} jumps across sheets: values on both sides of a level may meet "
             "without any in between, so it bounds no solid"
@@ -131,14 +131,14 @@ class SublevelSolid(SolidOfField):
 
     def __post_init__(self) -> None:
         self._copy_settings()
-        domain = None if self.field.is_global else self.field.domain
+        domain = None if self.field.traits.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where f <= level or, if `above`, all points
         where f >= level. None if no such volume is known, as for a field that is defined in all of
         space."""
-        if self.field.is_global:
+        if self.field.traits.is_global:
             return None
 
         def is_inside(value: float) -> bool:
@@ -209,10 +209,10 @@ def bounded_side_extent(
     the levels the whole complement lies. If it is outside the solid, the extent contains the solid.
     """
     extent = field.extent(levels)
-    if field.is_global and extent is field.domain:
+    if field.traits.is_global and extent is field.domain:
         # For a global field the domain only clips the picture, and bounds no level set.
         return None
-    if extent is None or (field.domain is not None and not field.is_global):
+    if extent is None or (field.domain is not None and not field.traits.is_global):
         return field.domain
     lower, upper = extent.bounds()
     if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
@@ -420,7 +420,7 @@ class BandSolid(SolidOfField):
         if period is not None and not 2 * self.half_width < period:
             raise ValueError(f"half_width must be below {period / 2:g}, half of the period")
         self._copy_settings()
-        domain = None if self.field.is_global else self.field.domain
+        domain = None if self.field.traits.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
@@ -444,7 +444,7 @@ class BandSolid(SolidOfField):
         """
         # The two values of f on the surface of these points.
         ends = tuple(self.level + sign * (self.half_width + level) for sign in (-1, 1))
-        if above or (self.field.is_global and self.field.period is None):
+        if above or (self.field.traits.is_global and self.field.period is None):
             return self.domain
 
         def is_inside(value: float) -> bool:

@@ -8,15 +8,15 @@ maps of space."""
 from __future__ import annotations
 
 import abc
-import copy
+import dataclasses
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from harnack.backend.validation import as_positive, no_derivatives
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import Evaluator, Plan
-from harnack.fields.field import Field
+from harnack.fields.field import Field, Traits
 from harnack.fields.formula import Formula, FormulaFunction
 from harnack.geometry import Ball, Box, Volume
 
@@ -114,8 +114,7 @@ class Solid(Field):
         solid f/lipschitz is a lower bound of the distance (Hart 1996, definition 3).
     """
 
-    over_relaxation = 1.0
-    has_creases = True
+    traits = Traits(over_relaxation=1.0, has_creases=True)
     lipschitz: Any = None
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -316,14 +315,15 @@ class SolidOfField(Solid):
     field: Any
 
     def _copy_settings(self, *names: str) -> None:
-        """Copy attributes of the inner field to this solid: the settings for the tracer, and the
-        further attributes with these names."""
-        settings = (
-            "over_relaxation",
-            "min_wavelength",
-            "is_cheap",
-        )
-        for name in (*settings, *names):
+        """Copy from the inner field to this solid what of its traits holds for the solid as well,
+        and the attributes with these names."""
+        inner = self.field.traits
+        traits = dataclasses.replace(
+            self.traits, over_relaxation=inner.over_relaxation, is_cheap=inner.is_cheap,
+            min_wavelength=inner.min_wavelength, has_variable_accuracy=inner.has_variable_accuracy,
+        )  # fmt: skip
+        object.__setattr__(self, "traits", traits)
+        for name in names:
             object.__setattr__(self, name, getattr(self.field, name))
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
@@ -337,13 +337,7 @@ class SolidOfField(Solid):
 
     def _with_inner(self, inner: Field) -> Solid:
         """The same solid made of another inner field."""
-        solid = copy.copy(self)
-        object.__setattr__(solid, "field", inner)
-        return solid
-
-    @property
-    def has_variable_accuracy(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.field.has_variable_accuracy
+        return dataclasses.replace(cast("Any", self), field=inner)
 
 
 @dataclass(frozen=True, eq=False)

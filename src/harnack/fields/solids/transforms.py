@@ -259,10 +259,9 @@ class TransformedSolid(SolidOfField):
         constant = self.field.lipschitz
         lipschitz = None if constant is None else constant * numbers.stretch * numbers.factor
         object.__setattr__(self, "lipschitz", lipschitz)
-        wavelength = self.field.min_wavelength
-        object.__setattr__(
-            self, "min_wavelength", None if wavelength is None else wavelength / numbers.stretch
-        )
+        if (wavelength := self.field.traits.min_wavelength) is not None:
+            traits = dataclasses.replace(self.traits, min_wavelength=wavelength / numbers.stretch)
+            object.__setattr__(self, "traits", traits)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         inner_level = level / self.map.value_factor
@@ -271,7 +270,7 @@ class TransformedSolid(SolidOfField):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         return _TransformedSolidEvaluator(
             self.field.evaluator(backend, without_levels(plan)),
-            self.inverse_map.prepare(backend),
+            self.inverse_map.on_backend(backend),
             is_similarity=self.map.similarity is not None,
         )
 
@@ -459,7 +458,7 @@ class _InverseMap:
             float(np.abs(change.translation_vector).max()),
         )
 
-    def prepare(self, backend: Backend) -> _InverseMap:
+    def on_backend(self, backend: Backend) -> _InverseMap:
         """The same map with the entries of its matrix and its vector as kernel parameters of the
         backend (numbers that a compiled kernel reads when it runs). Entries that are 0 or 1 stay
         Python numbers: then their terms or products are left out of the kernel, which saves most of
