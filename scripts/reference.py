@@ -136,7 +136,7 @@ def find(name: str) -> Any:
 
 def members_of(kind: type) -> Iterator[tuple[str, Any]]:
     """The public methods and properties that a class itself defines and documents."""
-    # `Field` makes `evaluate` of `evaluator`, or the other way round: what is made is nothing of theirs.
+    # What `Field` has made, `evaluate` of `evaluator` or the other way round, is not theirs.
     attributes: dict[str, Any] = {
         name: value
         for name, value in vars(kind).items()

@@ -360,9 +360,9 @@ class Session:
 
         rays: the number of rays of the next picture.
 
-        The surfaces of the last call are returned again if the controls are the same. But once twice
-        as many rays were traced as they were prepared for, the surfaces are prepared again: then
-        building cells may take less time than it saves. Cells hold local expansions of the
+        The surfaces of the last call are returned again if the controls are the same. But once
+        twice as many rays were traced as they were prepared for, the surfaces are prepared again:
+        then building cells may take less time than it saves. Cells hold local expansions of the
         field, which make each ray faster.
         """
         # Arrays are compared by their bytes.
