@@ -17,6 +17,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy
 from harnack.fields import Field, Sample
 from harnack.fields.analytic.waves import PlaneWave, WaveProduct, cosine_factor, sine_factor
+from harnack.fields.parameters import differentiable_parameters
 from harnack.files.molecules import Atoms
 from harnack.geometry.example_meshes import icosphere
 
@@ -409,8 +410,8 @@ def test_derivatives_are_refused_or_kept() -> None:
         waves(1.0).replace(**{"terms.0.amplitude": number})
     curve = hk.SolidAngle(_TRIANGLE).replace(loops=loop)
     assert curve.parameters()["loops.0"] is loop
-    assert curve.differentiable_parameters() == (loop,)
-    assert hk.SolidAngle(_TRIANGLE).differentiable_parameters() == ()
+    assert differentiable_parameters(curve) == (loop,)
+    assert differentiable_parameters(hk.SolidAngle(_TRIANGLE)) == ()
     dr.backward(dr.sum(curve.value(backend.Array3f(0.2, 0.3, 0.5))))
     assert np.abs(to_numpy(dr.grad(loop))).max() > 0
 
@@ -418,7 +419,7 @@ def test_derivatives_are_refused_or_kept() -> None:
 class MovingCharge(Charge):
     """A charge with derivatives by its strength, if that is a Dr.Jit array."""
 
-    has_parameter_derivatives = True
+    traits = hk.fields.Traits(has_parameter_derivatives=True)
 
 
 class Hidden(MovingCharge):
@@ -435,7 +436,7 @@ def test_a_users_field_has_derivatives_by_its_parameters() -> None:
     strength = backend.Float(2.0)
     field = Charge((0.0, 0.0, 0.0)).replace(strength=strength)
     assert field.parameters()["strength"] is strength
-    assert field.differentiable_parameters() == ()
+    assert differentiable_parameters(field) == ()
     points = backend.Array3f(0.0, 0.0, 4.0)
     dr.enable_grad(strength)
     with pytest.raises(NotImplementedError, match="Charge cannot be differentiated"):
@@ -443,7 +444,7 @@ def test_a_users_field_has_derivatives_by_its_parameters() -> None:
     with pytest.raises(NotImplementedError, match="Charge cannot be differentiated"):
         Charge((0.0, 0.0, 0.0), strength)
     moving = MovingCharge((0.0, 0.0, 0.0), strength)
-    assert moving.differentiable_parameters() == (strength,)
+    assert differentiable_parameters(moving) == (strength,)
     dr.backward(moving.value(points))
     assert dr.grad(strength)[0] == 0.25
     hits = hk.trace(moving, backend.Array3f(0, 0, 9), backend.Array3f(0, 0, -1), level=0.5)
@@ -457,7 +458,7 @@ def test_derivatives_by_what_is_no_parameter_are_refused() -> None:
     strength = backend.Float(2.0)
     dr.enable_grad(strength)
     hidden = Hidden([strength])
-    assert hidden.differentiable_parameters() == ()
+    assert differentiable_parameters(hidden) == ()
     with pytest.raises(NotImplementedError, match="Hidden cannot be differentiated"):
         hidden.value(backend.Array3f(0.0, 0.0, 4.0))
     with pytest.raises(NotImplementedError, match="Hidden cannot be differentiated"):

@@ -44,8 +44,8 @@ ROOMS = (
 # Within `fields`: the interface, what families share, and the families.
 FIELD_ROOMS = (
     "capabilities",
-    "batch_evaluation",
     "parameters",
+    "batch_evaluation",
     "evaluator",
     "field",
     "formula",

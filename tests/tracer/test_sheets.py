@@ -995,7 +995,7 @@ def test_the_level_moves_smooth_hits_only() -> None:
 
 def test_derivatives_by_parameters_are_refused() -> None:
     class Moving(BruteForceWinding):
-        has_parameter_derivatives = True
+        traits = hk.fields.Traits(has_jumps=True, has_parameter_derivatives=True)
 
         def parameters(self) -> dict[str, Any]:
             return {"where": where}

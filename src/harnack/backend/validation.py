@@ -181,7 +181,7 @@ def check_no_derivatives(name: str, *values: Any) -> None:
             f"{name} cannot be differentiated by these numbers, which carry derivatives: detach "
             "them, as drjit.detach and torch.Tensor.detach do (known are derivatives by rays, "
             "levels, points, the vertices of a SolidAngle, and by the parameters of a field of "
-            "your own whose class has has_parameter_derivatives = True)"
+            "your own whose traits are harnack.fields.Traits(has_parameter_derivatives=True))"
         )
 
 

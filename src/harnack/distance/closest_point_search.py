@@ -48,6 +48,7 @@ from harnack.fields.capabilities import NO_FACET, exactly_sampled
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.evaluator import Evaluator
 from harnack.fields.field import Field
+from harnack.fields.solids.solid import Solid
 from harnack.geometry.neighborhoods import kd_tree
 
 if TYPE_CHECKING:
@@ -233,7 +234,8 @@ def _with_crease_points(
         a fraction of the tolerance.
     """
     backend, surface = query.backend, query.surface
-    operands = surface.field.operands()
+    field = surface.field
+    operands = field.operands() if isinstance(field, Solid) else ()
     rows = np.flatnonzero(~(_length(points - closest) <= settled))
     if not 1 < len(operands) <= MAX_OPERANDS or not len(rows):
         return closest

@@ -59,7 +59,7 @@ def signed_distance(
     a level set of a field's function f.
 
     Points with f < level are inside. For winding numbers, clouds and blobs, which are larger inside
-    (`Field.is_larger_inside`), points with f > level are inside. (trimesh has the opposite sign.)
+    (`Traits.is_larger_inside`), points with f > level are inside. (trimesh has the opposite sign.)
 
     surface: a field or a `Surface`; `side` and `largest` are not accepted. If there are several
         levels, the sign belongs to the level nearest in value. For an angle-valued field, a level
@@ -130,7 +130,7 @@ def signed_distance(
 def _outwards(field: Field) -> float:
     """Return the factor, 1 or -1, that makes a distance with the sign of f - level negative inside.
     It is -1 for fields that are larger inside."""
-    return -1.0 if field.is_larger_inside else 1.0
+    return -1.0 if field.traits.is_larger_inside else 1.0
 
 
 @accepts_dask_arrays("points")

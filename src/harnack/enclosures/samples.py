@@ -163,7 +163,8 @@ def validate_samples(
             )
         # Derivatives of the value that do not come from p would be lost.
         # (An evaluator does not know; its field does.)
-        keeps_derivatives = getattr(self, "has_parameter_derivatives", True)
+        traits = getattr(self, "traits", None)
+        keeps_derivatives = traits is None or traits.has_parameter_derivatives
         if not keeps_derivatives and not dr.grad_enabled(p):
             check_no_derivatives(type(self).__name__, sample.value)
         return _unbox_numpy(sample).map_promises(_unbox_numpy)

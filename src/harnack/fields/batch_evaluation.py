@@ -23,6 +23,7 @@ from harnack.backend.arrays import (
 )
 from harnack.backend.validation import check_no_derivatives
 from harnack.cluster.dask_arrays import accepts_dask_arrays
+from harnack.fields.parameters import differentiable_parameters
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Vec3
@@ -86,7 +87,7 @@ def accepts_numpy_points(hessian: Callable[[Any, Vec3], Any]) -> Callable[..., A
         """
         if dr.is_array_v(type(p)):
             check_no_derivatives(
-                f"the Hessian of {type(self).__name__}", p, self.differentiable_parameters()
+                f"the Hessian of {type(self).__name__}", p, differentiable_parameters(self)
             )
             return hessian(self, p)
 

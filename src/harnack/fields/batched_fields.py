@@ -25,6 +25,7 @@ from harnack.fields.batch_evaluation import evaluate_points
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, SampleEvaluator, Traits
+from harnack.fields.parameters import differentiable_parameters
 from harnack.fmm.point_values import PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
@@ -398,7 +399,7 @@ def cached_upload(upload: Upload) -> Upload:
     @functools.wraps(upload)
     def cached(self: Field, backend: Backend, *arguments: Any, **settings: Any) -> Any:
         """The data: the cached ones, unless the field has parameters."""
-        if self.differentiable_parameters():
+        if differentiable_parameters(self):
             return upload(self, backend, *arguments, **settings)
         uploads = cache.get(self, None, dict)
         key = backend, arguments, tuple(sorted(settings.items()))
@@ -418,4 +419,4 @@ def keeps_uploads(field: Field) -> bool:
     """Whether the data of a field on a backend are cached (`cached_upload`). Then they, and the
     function, do not change unless an attribute of the field is set."""
     upload = getattr(type(field), "_upload", None)
-    return hasattr(upload, "is_cached_upload") and not field.differentiable_parameters()
+    return hasattr(upload, "is_cached_upload") and not differentiable_parameters(field)

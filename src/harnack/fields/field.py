@@ -35,7 +35,7 @@ from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, Taylor
 from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, validate_samples
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
-from harnack.fields.parameters import Parametrized, record_call
+from harnack.fields.parameters import Parametrized, differentiable_parameters, record_call
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import with_article
 
@@ -99,6 +99,11 @@ class Traits:
         own. Then `Evaluator.patches` is an object.
     has_variable_accuracy: whether f is sampled with different accuracy whatever the number of rays.
         Then `Evaluator.variable_accuracy` is an object.
+    is_larger_inside: whether f is larger inside of its surfaces than outside, as a winding number
+        is. Then the inside is where f > level; else it is where f < level, as for signed distances.
+    has_parameter_derivatives: whether f can be differentiated with respect to those of its
+        parameters that are Dr.Jit arrays. If not, the constructor refuses arguments with
+        derivatives enabled.
     """
 
     over_relaxation: float = 1.4
@@ -109,6 +114,8 @@ class Traits:
     has_jumps: bool = False
     has_patches: bool = False
     has_variable_accuracy: bool = False
+    is_larger_inside: bool = False
+    has_parameter_derivatives: bool = False
 
 
 class Field(Parametrized, abc.ABC):
@@ -130,10 +137,6 @@ class Field(Parametrized, abc.ABC):
     default_level: float = 0.0
     """The level that is drawn if the user names none."""
 
-    is_larger_inside: bool = False
-    """Whether f is larger inside of its surfaces than outside, as a winding number is. Then the
-    inside is where f > level; else it is where f < level, as for signed distances."""
-
     domain: Volume | None = None
     """The convex volume in which the field may be evaluated and is drawn; None for all of space.
     Rays are clipped to it, and samples need only be right at points p in it. As it is convex, a
@@ -148,11 +151,11 @@ class Field(Parametrized, abc.ABC):
 
         Raises:
             NotImplementedError: arguments with derivatives enabled, which would be lost because the
-                class does not have `has_parameter_derivatives`.
+                traits of the class do not say `has_parameter_derivatives`.
             TypeError: the class defines neither `evaluate` nor `evaluator`; or an argument `domain`
                 that is neither a volume nor None.
         """
-        if not cls.has_parameter_derivatives:
+        if not cls.traits.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
@@ -282,12 +285,6 @@ class Field(Parametrized, abc.ABC):
         del levels
         return self.domain
 
-    def operands(self) -> tuple[Field, ...]:
-        """The fields of which this one is combined: at each point its function is that of one of
-        them. So each of its level sets lies in the union of theirs at the same level. A field that
-        is no combination is its own only operand."""
-        return (self,)
-
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError if f is proved never to take one of the levels. The default accepts all
         levels."""
@@ -310,7 +307,7 @@ class Field(Parametrized, abc.ABC):
         """
         if dr.is_array_v(type(points)):
             refuse_hidden_parameters(self)
-            if any(dr.grad_enabled(array) for array in (points, *self.differentiable_parameters())):
+            if any(dr.grad_enabled(array) for array in (points, *differentiable_parameters(self))):
                 return self.evaluator(backend_of(points)).differentiable_value(points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
@@ -331,7 +328,7 @@ class Field(Parametrized, abc.ABC):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         refuse_hidden_parameters(self)
         check_no_derivatives(
-            f"the gradient of {type(self).__name__}", self.differentiable_parameters()
+            f"the gradient of {type(self).__name__}", differentiable_parameters(self)
         )
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
@@ -478,7 +475,7 @@ class SampleEvaluator(Evaluator):
         return self.field.hessian(p)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        if any(map(dr.grad_enabled, self.field.differentiable_parameters())):
+        if any(map(dr.grad_enabled, differentiable_parameters(self.field))):
             return self.evaluate(p).value
         refuse_hidden_parameters(self.field)
         return super().differentiable_value(p)
@@ -486,14 +483,14 @@ class SampleEvaluator(Evaluator):
 
 def refuse_hidden_parameters(field: Field) -> None:
     """Raise NotImplementedError if a field holds numbers with derivatives enabled, for example in
-    its formula, and these derivatives would be lost. They would be lost if its class does not have
+    its formula, and these derivatives would be lost. They would be lost if its traits do not say
     `has_parameter_derivatives`; or, for a user's class, if none of the field's `parameters` has
     derivatives enabled."""
     kind = type(field)
     # The `evaluate` of a user's class may refer to such numbers, too.
     is_users = not kind.__module__.startswith("harnack.")
-    if field.has_parameter_derivatives and (
-        not is_users or any(map(dr.grad_enabled, field.differentiable_parameters()))
+    if field.traits.has_parameter_derivatives and (
+        not is_users or any(map(dr.grad_enabled, differentiable_parameters(field)))
     ):
         return
     check_no_derivatives(kind.__name__, vars(field), kind.evaluate if is_users else None)

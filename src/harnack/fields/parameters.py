@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -121,10 +121,6 @@ class Parametrized:
     """An object whose parameters, the numbers and arrays in the arguments of its constructor, have
     names."""
 
-    has_parameter_derivatives: ClassVar[bool] = False
-    """Whether f can be differentiated with respect to those of its parameters that are Dr.Jit
-    arrays. If it is false, the constructor refuses arguments with derivatives enabled."""
-
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of the constructor by name, in the form in which it takes them.
 
@@ -173,7 +169,7 @@ class Parametrized:
             NotImplementedError: values with derivatives enabled, which would be lost.
             The errors of the constructor, which checks the new values.
         """
-        if not self.has_parameter_derivatives:  # also of what is only a part of an argument
+        if not _keeps_derivatives(self):  # also of what is only a part of an argument
             check_no_derivatives(type(self).__name__, changes)
         call, arguments = _call_of(self), self.constructor_arguments()
         signature = _signature(type(self), call.maker)
@@ -220,13 +216,20 @@ class Parametrized:
                     f"{did_you_mean(name, sorted(known))}; there are {', '.join(listed)}{more}"
                 )
 
-    def differentiable_parameters(self) -> tuple[Any, ...]:
-        """The parameters that are Dr.Jit arrays, with respect to which f can be differentiated,
-        such as the vertices of a curve that is optimized. There are none unless the class has
-        `has_parameter_derivatives`."""
-        if not self.has_parameter_derivatives:
-            return ()
-        return tuple(value for value in self.parameters().values() if _is_drjit(value))
+
+def _keeps_derivatives(instance: Any) -> bool:
+    """Whether an object is a field whose traits say `has_parameter_derivatives`."""
+    traits = getattr(instance, "traits", None)
+    return traits is not None and traits.has_parameter_derivatives
+
+
+def differentiable_parameters(instance: Parametrized) -> tuple[Any, ...]:
+    """The parameters of an object that are Dr.Jit arrays, with respect to which f can be
+    differentiated, such as the vertices of a curve that is optimized. There are none unless the
+    object is a field whose traits say `has_parameter_derivatives`."""
+    if not _keeps_derivatives(instance):
+        return ()
+    return tuple(value for value in instance.parameters().values() if _is_drjit(value))
 
 
 def _stored(instance: object, name: str) -> Any:

@@ -31,6 +31,7 @@ from harnack.enclosures import Levels
 from harnack.fields.batched_fields import FieldCache
 from harnack.fields.capabilities import EXACT
 from harnack.fields.field import refuse_hidden_parameters
+from harnack.fields.parameters import differentiable_parameters
 from harnack.tracer.level_contact import RayStatus
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     # the memory has a single entry for each field.)
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         refuse_hidden_parameters(field)
-    parameters = prepared.field.differentiable_parameters()
+    parameters = differentiable_parameters(prepared.field)
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
     if field_has_derivatives and prepared.evaluator.jumps is not None:
         name = type(prepared.field).__name__
@@ -109,7 +110,7 @@ def refuse_derivative(
         these.
     result_name: the name of the result, for the message.
     """
-    sources = [o, d, *prepared.levels.values, *prepared.field.differentiable_parameters()]
+    sources = [o, d, *prepared.levels.values, *differentiable_parameters(prepared.field)]
     return dr.custom(_NoDerivative, value, result_name, sources)
 
 
@@ -166,7 +167,7 @@ def attach_derivatives(
     # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
     # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
-    if any(dr.grad_enabled(parameter) for parameter in prepared.field.differentiable_parameters()):
+    if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(prepared.field)):
         # f depends on parameters, too: its own derivative has all of them.
         value = prepared.evaluator.differentiable_value(point)
         change = value - dr.detach(value)

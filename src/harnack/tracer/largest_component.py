@@ -18,6 +18,7 @@ from harnack.backend.elementary import safe_norm
 from harnack.enclosures import Levels
 from harnack.fields.batched_fields import FieldCache
 from harnack.fields.clearance import clearance_function
+from harnack.fields.parameters import differentiable_parameters
 from harnack.tree.empty_space import OccupancyGrid, largest_connected_component
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def largest_component_cells(
         """Compute the grid, which is not in the cache."""
         return _build_cells(field, levels, volume, solid, across)
 
-    if field.differentiable_parameters():  # they may change in place
+    if differentiable_parameters(field):  # they may change in place
         return build()
     return _CELLS.get(field, (levels, volume, solid, across), build)
 

@@ -20,6 +20,7 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
 from harnack.fields.evaluator import Plan
+from harnack.fields.parameters import differentiable_parameters
 from harnack.geometry import ConvexHull
 from harnack.name_suggestions import with_article
 from harnack.tracer.largest_component import largest_component_cells
@@ -244,7 +245,7 @@ class TracedSurface:
     def evaluator(self, backend: Backend) -> Evaluator:
         """Return the field's evaluator for these levels and this number of rays. It is cached; a
         field with derivatives enabled and one without have separate entries."""
-        parameters = self.field.differentiable_parameters()
+        parameters = differentiable_parameters(self.field)
         has_derivatives = any(map(dr.grad_enabled, parameters))
         key, plan = ("evaluator", backend, self.ray_count, has_derivatives), self.plan
         return self.memoize(key, lambda: self._checked(self.field.evaluator(backend, plan)))

@@ -99,9 +99,8 @@ class Blobs(Formula):
         BlobError: numbers that are not valid blobs (a ValueError).
     """
 
-    traits = dataclasses.replace(Formula.traits, is_cheap=False)
+    traits = dataclasses.replace(Formula.traits, is_cheap=False, is_larger_inside=True)
     default_level: float = 1.0
-    is_larger_inside = True
     period: ClassVar[float | None] = None
 
     def __init__(

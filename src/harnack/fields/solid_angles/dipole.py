@@ -354,7 +354,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
 
     period: ClassVar[float | None] = None
     default_level: float = 2 * math.pi
-    is_larger_inside = True
+    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
 
     def __init__(
         self,

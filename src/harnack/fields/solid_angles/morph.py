@@ -71,7 +71,6 @@ class Morph(BatchedField):
     """
 
     default_level = 0.5
-    is_larger_inside = True
 
     def __init__(
         self,

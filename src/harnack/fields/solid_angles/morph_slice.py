@@ -14,6 +14,7 @@ dimensions from a point of the slice to a quadrature point.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -413,7 +414,7 @@ class MorphSlice(SourceSum):
     """
 
     default_level = 0.5
-    is_larger_inside = True
+    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
 
     def __init__(
         self, corners: Sequence[FloatArray], *, w: float, gap: float, spacing: float,

@@ -303,7 +303,7 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     or accuracy.
     """
 
-    is_larger_inside = True
+    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
 
     def __init__(
         self,

@@ -142,8 +142,8 @@ class SolidAngle(FieldWithCells):
 
     period: ClassVar[float | None] = _PERIOD
     default_level: float = 2 * math.pi
-    traits = Traits(over_relaxation=1.3)  # by experiment
-    has_parameter_derivatives: ClassVar[bool] = True
+    # The over-relaxation is by experiment.
+    traits = Traits(over_relaxation=1.3, has_parameter_derivatives=True)
 
     def __init__(
         self,

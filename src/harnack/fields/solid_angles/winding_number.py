@@ -285,8 +285,7 @@ class WindingNumber(FieldWithCells, BatchedField):
 
     period: ClassVar[float | None] = None
     default_level: float = 0.5
-    is_larger_inside = True
-    traits = Traits(has_jumps=True)
+    traits = Traits(has_jumps=True, is_larger_inside=True)
 
     def __init__(
         self,

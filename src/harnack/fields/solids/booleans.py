@@ -27,7 +27,6 @@ from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, Negate
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field
 from harnack.fields.formula import on_backend, probe_jets
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
@@ -140,7 +139,7 @@ class BooleanSolid(Solid):
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
 
-    def operands(self) -> tuple[Field, ...]:
+    def operands(self) -> tuple[Solid, ...]:
         return tuple(operand for part in self.parts for operand in part.operands())
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:

@@ -132,6 +132,12 @@ class Solid(Field):
         known, one that contains all points with f at least the lowest level."""
         return self.sublevel_extent(max(levels)) or self.sublevel_extent(min(levels), above=True)
 
+    def operands(self) -> tuple[Solid, ...]:
+        """The solids of which this one is combined: at each point its function is that of one of
+        them. So each of its level sets lies in the union of theirs at the same level. A solid that
+        is no combination is its own only operand."""
+        return (self,)
+
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates that are Dr.Jit numbers, or jets (ranges of numbers and of their
         derivatives).
@@ -329,10 +335,10 @@ class SolidOfField(Solid):
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
-    def operands(self) -> tuple[Field, ...]:
+    def operands(self) -> tuple[Solid, ...]:
         """If the inner field is a combination, the solids of the same kind, such as complements, of
         its operands; otherwise this solid alone."""
-        inner = self.field.operands()
+        inner = self.field.operands() if isinstance(self.field, Solid) else ()
         return tuple(map(self._with_inner, inner)) if len(inner) > 1 else (self,)
 
     def _with_inner(self, inner: Field) -> Solid:
