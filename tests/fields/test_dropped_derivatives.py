@@ -205,7 +205,7 @@ PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
 }
 # Records of settings, results and pictures, and proofs.
 NO_PARTS = {"Boundary", "NearestFacet", "PatchEntry", "VariableAccuracy", "JumpCrossing",
-            "LevelGaps", "MarchResult", "Plan", "SurfaceTracer", "TraceOptions",
+            "LevelGaps", "MarchResult", "Plan", "SurfaceTracer", "TraceOptions", "Traits",
             "TracedSurface", "RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits",
             "Isolines", "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
             "WallThickness", "HitTolerance", "LiveView"}  # fmt: skip
