@@ -401,7 +401,7 @@ class _Query:
         sum with a truncation error, on the level set of the exact sum (else None).
     _domain, _clip: the field's domain; and the descent to the clip curve, in which the boundary of
         the domain cuts the surface (None without a domain).
-    _tracer: for functions with jumps, the surface prepared for tracing rays in double precision.
+    _tracer: for functions with jumps, the tracer of the surface in double precision.
     """
 
     backend: Backend

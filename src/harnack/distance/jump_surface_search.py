@@ -62,7 +62,7 @@ class JumpSurfaceSearch:
     belongs to the surface where a level lies between the values of f on its two sides. A probe is a
     short ray that tests this.
 
-    surface: the surface, prepared on a backend.
+    surface: the tracer of the surface.
     scale: an upper bound of the coordinates that the field computes with, for bounds of rounding
         errors.
     max_facets: the largest number of facets that are examined for each point.

@@ -48,7 +48,7 @@ _PLANES_PER_ITERATION = 4
 _UNBOUNDED_PLANE = (0.0, 0.0, 0.0, 1e30)
 
 FoldState = TypeVar("FoldState", bound=tuple[Any, ...])
-Prepared = TypeVar("Prepared", bound="Polytope")
+Uploaded = TypeVar("Uploaded", bound="Polytope")
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,12 +171,12 @@ class Polytope(Volume):
     def planes(self) -> FloatArray:
         """The planes as rows (nx, ny, nz, h), shape (m, 4), float64, all finite."""
 
-    def upload(self: Prepared, backend: Backend) -> Prepared:
+    def upload(self: Uploaded, backend: Backend) -> Uploaded:
         """An equal polytope whose planes are in a buffer on the backend."""
         return replace(self, _device_planes=PlaneTable.upload(backend, self.planes()))
 
     def _plane_table(self, backend: Backend) -> PlaneTable:
-        """The prepared table of planes if there is one for this backend, otherwise a new one. A new
+        """The uploaded table of planes if there is one for this backend, otherwise a new one. A new
         table consists of literals if there are few planes, or while a loop is recorded, when
         nothing can be uploaded."""
         if self._device_planes is not None and self._device_planes.backend == backend:
@@ -327,7 +327,7 @@ class Ball(Volume):
 
     def _center_and_radius(self, backend: Backend) -> tuple[Vec3, Real]:
         """The center (3,) and the radius on the backend: kernel parameters if the ball was
-        prepared, otherwise literals."""
+        uploaded, otherwise literals."""
         if self._device_numbers is not None and backend_of(self._device_numbers[0]) == backend:
             return self._device_numbers
         return backend.Array3f(*self.center), backend.Float(self.radius)

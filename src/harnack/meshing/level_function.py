@@ -85,7 +85,7 @@ class LevelFunction:
     (`_backend`), and `_levels` holds the level there.
 
     most_faces: the largest allowed number of triangles of the level set's mesh.
-    uploads: holds fields prepared for double precision; several functions may share it.
+    uploads: holds evaluators in double precision; several functions may share it.
     secant_steps: the number of secant steps that find the point at which an edge of a cell meets
         the level set, for functions that are nearly linear along edges, such as distances. With 0
         it is found by a search.

@@ -171,7 +171,7 @@ class Isolines:
             )
         return period / line_count
 
-    def upload(self, backend: Backend, size: float) -> PreparedIsolines:
+    def upload(self, backend: Backend, size: float) -> DeviceIsolines:
         """Return the isolines with their numbers uploaded to a backend (the device that traces
         rays).
 
@@ -183,7 +183,7 @@ class Isolines:
         volume = padded_domain(self.function_field, size)
         # g, its volume, half the width of a line, the interval or else the table of levels, and the
         # period of g; what does not exist is None.
-        return PreparedIsolines(
+        return DeviceIsolines(
             self.function_field.evaluator(backend),
             None if volume is None else volume.upload(backend),
             dr.opaque(backend.Float, 0.5 * width),
@@ -195,7 +195,7 @@ class Isolines:
 
 def _table(levels: tuple[float, ...], period: float | None) -> FloatArray:
     """Return a table of 2^k - 1 numbers in ascending order: the levels, then inf as filler.
-    `PreparedIsolines` searches it for the level nearest to a value.
+    `DeviceIsolines` searches it for the level nearest to a value.
 
     period: of a function whose values are angles, else None. The levels of such a function are
         reduced to [0, period). A copy of the last level minus the period precedes them, and a copy
@@ -247,7 +247,7 @@ def parse_isolines(isolines: Any) -> tuple[Isolines, ...]:
 
 
 @dataclass(frozen=True)
-class PreparedIsolines:
+class DeviceIsolines:
     """Isolines whose numbers are uploaded to a backend (the device that traces rays). The lines are
     on a surface, where another function g takes given values, its levels. All numbers are kernel
     parameters, so other numbers compile no other kernel.
@@ -331,9 +331,7 @@ class PreparedIsolines:
         return dr.minimum(dr.abs(g - before), dr.abs(g - after))
 
 
-def isoline_index_at(
-    lines: tuple[PreparedIsolines, ...], p: Vec3, normal: Vec3, index: Any
-) -> Index:
+def isoline_index_at(lines: tuple[DeviceIsolines, ...], p: Vec3, normal: Vec3, index: Any) -> Index:
     """Return the number of the isoline on which each point lies, counted from 1; 0 if it lies on
     none, and the last one if several overlap.
 

@@ -192,7 +192,7 @@ def register() -> Any:
     def make_shape(props: Any) -> Any:
         """Return the shape for the properties that a scene gives: a proxy, the Mitsuba mesh that
         stands for the surface and that no ray of Mitsuba hits."""
-        # With a cache the field is prepared for tracing only once for this shape.
+        # With a cache the evaluator is made only once for this shape.
         surface = surface_from_properties(props).with_call_cache()
         return mitsuba_proxy.from_properties(mi, props, surface)
 
@@ -318,7 +318,7 @@ def mitsuba_shape(
         # The verb is the subject of messages of errors.
         surface = traced_surface(surface, options, verb="a shape", **keywords)
     check_has_inside(surface)
-    # With a cache the field is prepared for tracing only once for this shape.
+    # With a cache the evaluator is made only once for this shape.
     surface = surface.with_call_cache()
     props = mi.Properties()
     props["bsdf"] = as_bsdf(mi, bsdf)

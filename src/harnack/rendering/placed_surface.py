@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from harnack.backend import FloatArray
 from harnack.backend.loops import compute_on_active
-from harnack.rendering.isolines import Isolines, PreparedIsolines, isoline_index_at
+from harnack.rendering.isolines import DeviceIsolines, Isolines, isoline_index_at
 from harnack.rendering.surface_hits import CappedSolid, SurfaceHit, intersect_surface
 from harnack.tracer.pixel_cones import PixelCones
 
@@ -118,19 +118,19 @@ class PlacedSurface:
     the world. The map from the surface's own coordinates to the world is x -> scale R x +
     translation.
 
-    prepared: the tracer of the surface, in the surface's coordinates.
+    tracer: the tracer of the surface, in the surface's coordinates.
     solid: the solid whose boundary is drawn; None for a level set.
     scale, rotation_rows, translation: the map. rotation_rows holds the rows of R. All numbers are
         kernel parameters.
     isolines: the isolines that are drawn on it.
     """
 
-    prepared: SurfaceTracer
+    tracer: SurfaceTracer
     solid: CappedSolid | None
     scale: Real
     rotation_rows: tuple[Vec3, Vec3, Vec3]
     translation: Vec3
-    isolines: tuple[PreparedIsolines, ...] = ()
+    isolines: tuple[DeviceIsolines, ...] = ()
 
     @classmethod
     def of(
@@ -147,21 +147,21 @@ class PlacedSurface:
         def vector(numbers: FloatArray) -> Vec3:
             return backend.Array3f(*(dr.opaque(backend.Float, float(x)) for x in numbers))
 
-        prepared = surface.tracer(backend)
-        solid = None if surface.solid_range is None else CappedSolid.of(surface, prepared)
+        tracer = surface.tracer(backend)
+        solid = None if surface.solid_range is None else CappedSolid.of(surface, tracer)
         rows = tuple(vector(row) for row in placement.rotation)
         scale = dr.opaque(backend.Float, placement.scale)
         lines = tuple(isoline.upload(backend, size) for isoline in isolines)
-        return cls(prepared, solid, scale, rows, vector(placement.translation), lines)
+        return cls(tracer, solid, scale, rows, vector(placement.translation), lines)
 
     def queued(self) -> PlacedSurface:
         """Return this surface with another way of tracing: few lanes share a queue of rays. A lane
         that has finished a ray takes the next one from the queue, so no lane waits for a longer
         ray. Such rays are traced at once when the method is called, so it cannot be called while a
         kernel is being recorded."""
-        prepared = replace(self.prepared, uses_ray_queue=True)
-        solid = None if self.solid is None else replace(self.solid, prepared=prepared)
-        return replace(self, prepared=prepared, solid=solid)
+        tracer = replace(self.tracer, uses_ray_queue=True)
+        solid = None if self.solid is None else replace(self.solid, tracer=tracer)
+        return replace(self, tracer=tracer, solid=solid)
 
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, leaves: Real = 0.0
@@ -177,7 +177,7 @@ class PlacedSurface:
         if self.solid is not None:
             hit = self.solid.intersect(o, d, t_max, active, leaves)
         else:
-            hit = intersect_surface(self.prepared, o, d, t_max, active)
+            hit = intersect_surface(self.tracer, o, d, t_max, active)
         if self.isolines:
             hit = replace(hit, isoline_index=self._isoline_index(hit))
         position = self.scale * self._to_world(hit.position) + self.translation
@@ -195,7 +195,7 @@ class PlacedSurface:
 
         hit: in the coordinates of the surface, not of the world.
         """
-        index = self.prepared.backend.UInt32
+        index = self.tracer.backend.UInt32
 
         def find_index(point: _HitPoint) -> _IsolineIndex:
             """Return the numbers of the isolines at points, as an `_IsolineIndex`."""
@@ -204,7 +204,7 @@ class PlacedSurface:
             )
 
         point, no_isoline = _HitPoint(hit.position, hit.normal), _IsolineIndex(index(0))
-        if self.prepared.uses_ray_queue:
+        if self.tracer.uses_ray_queue:
             return compute_on_active(hit.is_hit, find_index, point, no_isoline).isoline_index
         return dr.select(hit.is_hit, find_index(point).isoline_index, 0)
 
@@ -216,11 +216,11 @@ class PlacedSurface:
         across, down: (3,) vectors from it to the points of the tangent plane in the middles of the
             neighboring pixels.
         """
-        vector = self.prepared.backend.Array3f
+        vector = self.tracer.backend.Array3f
         p = self._to_local(vector(position) - self.translation) / self.scale
         n = self._to_local(vector(normal))
         u, v = (self._to_local(vector(step)) / self.scale for step in (across, down))
-        is_near = self.prepared.backend.Bool(False)
+        is_near = self.tracer.backend.Bool(False)
         for isoline in self.isolines:
             is_near |= isoline.edge_is_near(p, n, u, v)
         return is_near
@@ -231,7 +231,7 @@ class PlacedSurface:
         o, d, t_max = self._local_ray(o, d, t_max)
         if self.solid is not None:
             return self.solid.occludes(o, d, t_max, active)
-        return self.prepared.occluded(o, d, 0, t_max, active)
+        return self.tracer.occluded(o, d, 0, t_max, active)
 
     def covers_in_part(
         self,
@@ -250,12 +250,12 @@ class PlacedSurface:
             radius lies inside the extent, and the extent lies inside the ball with the outer
             radius. None for an unbounded extent.
 
-        The surface must be prepared for crossings (`TracedSurface.prepare`).
+        The tracer must be one for crossings (`TracedSurface.tracer`).
         """
         o, d, t_max = self._local_ray(o, d, t_max)
         solid_range = None if self.solid is None else (self.solid.low, self.solid.high)
         cones = PixelCones(
-            self.prepared, o, d, self.prepared.backend.Float(radius), bounding_balls, solid_range
+            self.tracer, o, d, self.tracer.backend.Float(radius), bounding_balls, solid_range
         )
         # True: all cones are active. The second result, the number of evaluations, is not needed.
         return cones.partially_covered(t_max, True)[0]
@@ -264,14 +264,14 @@ class PlacedSurface:
         """Map rays o + t d, t <= t_max, from the world to the coordinates of the surface. Returns
         their origins, directions and largest parameters there. Directions keep the length 1, so
         parameters are divided by the scale."""
-        backend = self.prepared.backend
+        backend = self.tracer.backend
         local_origin = self._to_local(backend.Array3f(o) - self.translation) / self.scale
         return local_origin, self._to_local(backend.Array3f(d)), backend.Float(t_max) / self.scale
 
     def _to_world(self, v: Vec3) -> Vec3:
         """Rotate vectors (3,) from the surface's coordinates to the world's. They are neither
         scaled nor translated."""
-        return self.prepared.backend.Array3f(*(dr.dot(row, v) for row in self.rotation_rows))
+        return self.tracer.backend.Array3f(*(dr.dot(row, v) for row in self.rotation_rows))
 
     def _to_local(self, v: Vec3) -> Vec3:
         """Rotate vectors (3,) from the world's coordinates to the surface's. They are neither

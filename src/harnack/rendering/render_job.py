@@ -79,7 +79,7 @@ class RenderJob:
             section_material=options.section_material, isolines=options.isolines,
             thickness=options.thickness,
         )  # fmt: skip
-        # Fields are prepared more thoroughly if many rays are to be traced.
+        # Fields make a longer preparation if many rays are to be traced.
         ray_count = size[0] * size[1]
         if options.show not in (*AOV_MODES, "shaded"):
             ray_count *= _RAYS_A_PATH * (options.spp or STUDIO_SPP)

@@ -63,7 +63,7 @@ class ConeCoverage:
 
     def __init__(self, mi: Any, world: HybridScene) -> None:
         self.mi = mi
-        self.placed = tuple(_prepared(mi, proxy) for proxy in world.proxies)
+        self.placed = tuple(_with_crossings(mi, proxy) for proxy in world.proxies)
 
     def partly_covered(self, ray: Any, position: Any) -> Any:
         """Return the mask of pixels whose cones a surface covers in part, in front of the points
@@ -87,7 +87,7 @@ class ConeCoverage:
         return is_covered
 
 
-def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
+def _with_crossings(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
     """Prepare the surface of a proxy (the mesh that stands for it in Mitsuba) for cones. Returns
     the surface with a tracer of its own, and a ball inside its extent and a ball around its extent,
     as `inner_and_outer_ball` returns them.
@@ -107,7 +107,7 @@ def _prepared(mi: Any, proxy: Any) -> tuple[PlacedSurface, Any]:
             'values tell no distance. Leave antialias at "edges"'
         )
     # Cones need a tracer that finds where f crosses the level.
-    placed = replace(proxy.placed, prepared=surface.tracer(backend, crosses=True))
+    placed = replace(proxy.placed, tracer=surface.tracer(backend, crosses=True))
     return placed, inner_and_outer_ball(surface.volume, backend)
 
 

@@ -283,7 +283,7 @@ def _surface(
     # All options of surfaces and of traces that `render` has.
     honored = names_of("render", "surface", "trace")
     target, choices = surface_and_options("render", element, options, shorthand, honored)
-    # In the call's cache, the field is prepared only once.
+    # In the call's cache, the evaluator is made only once.
     surface = TracedSurface.of(target, choices).with_call_cache(begins=True)
     return with_visible_inside(surface, is_clear=is_clear)
 

@@ -3,7 +3,7 @@ the surface faces there.
 
 A field is a scalar function f of space, and its level set is the surface on which f equals a given
 number, the level. f may also jump across triangles, which are called facets; then they belong to
-the surface too. A `SurfaceTracer` (`prepared`) holds everything that tracing one surface needs. Its
+the surface too. A `SurfaceTracer` holds everything that tracing one surface needs. Its
 march moves along a ray by proved steps and ends near the surface, within a tolerance; the functions
 here move this end onto the surface and compute a normal that points to a known side.
 
@@ -73,12 +73,12 @@ class SurfaceHit:
 
 
 def intersect_surface(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, t_max: Real, active: Mask
 ) -> SurfaceHit:
     """Find the first hits of rays o + t d, |d| = 1, 0 <= t <= t_max, with the level set. Returns
     one `SurfaceHit`.
 
-    prepared: the tracer of the surface.
+    tracer: the tracer of the surface.
     active: mask of the rays that are traced.
 
     The march ends within the tolerance of the surface. One Newton step along the ray, one
@@ -91,15 +91,15 @@ def intersect_surface(
     values.
     """
     # The march goes from t = 0 to t_max.
-    trace = prepared.first_hit(o, d, 0, t_max, active)
-    if not prepared.uses_ray_queue:
-        return _refine_hits(prepared, _MarchedRays(o, d, trace))
+    trace = tracer.first_hit(o, d, 0, t_max, active)
+    if not tracer.uses_ray_queue:
+        return _refine_hits(tracer, _MarchedRays(o, d, trace))
     # With a queue of rays, the refinement is computed only for the rays that hit.
     return compute_on_active(
         trace.status == int(RayStatus.HIT),
-        lambda rays: _refine_hits(prepared, rays),
+        lambda rays: _refine_hits(tracer, rays),
         _MarchedRays(o, d, trace),
-        _no_hit(prepared, trace),
+        _no_hit(tracer, trace),
     )
 
 
@@ -113,10 +113,10 @@ class _MarchedRays:
     trace: MarchResult
 
 
-def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
+def _no_hit(tracer: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
     """Return the `SurfaceHit` of rays that hit nothing: of misses, and of rays that are out of
     steps. trace: how the march of each ray ended."""
-    backend = prepared.backend
+    backend = tracer.backend
     zero, vector, none = backend.Float(0), backend.Array3f(0), backend.Bool(False)
     return SurfaceHit(
         t=trace.t,
@@ -133,7 +133,7 @@ def _no_hit(prepared: SurfaceTracer, trace: MarchResult) -> SurfaceHit:
     )
 
 
-def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
+def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     """Return the `SurfaceHit` of marched rays. Hits are moved onto the surface as
     `intersect_surface` describes; other rays keep the end of their march.
 
@@ -142,36 +142,36 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     The march may stop within some distance of the level set (`_uncertainty`). Every movement is
     limited to `reach`, twice this distance.
     """
-    vector, o, d, trace = prepared.backend.Array3f, rays.o, rays.d, rays.trace
+    vector, o, d, trace = tracer.backend.Array3f, rays.o, rays.d, rays.trace
     # Of a union of patches (level sets of several functions), the patch that each ray hit.
-    prepared = prepared.hit_surface(trace)
-    is_hit, has_jumps = trace.status == int(RayStatus.HIT), prepared.evaluator.jumps is not None
+    tracer = tracer.hit_surface(trace)
+    is_hit, has_jumps = trace.status == int(RayStatus.HIT), tracer.evaluator.jumps is not None
     is_smooth = is_hit & ~trace.at_jump if has_jumps else is_hit
     # The difference between the nearest level and f at the end of the march.
-    value_to_level = prepared.levels.offset_to_nearest(trace.value)
+    value_to_level = tracer.levels.offset_to_nearest(trace.value)
     slope_on_ray = dr.dot(trace.gradient, d)
-    reach = _MAX_REFINEMENT * _uncertainty(prepared, trace.gradient, trace.t, trace.value)
+    reach = _MAX_REFINEMENT * _uncertainty(tracer, trace.gradient, trace.t, trace.value)
     newton_step = dr.select(
         is_smooth & (slope_on_ray != 0), dr.clip(value_to_level / slope_on_ray, -reach, reach), 0
     )
     # value_to_level > 0: the level is above, so the ray comes from the side of smaller values.
-    side = dr.select(value_to_level > 0, prepared.backend.Float(1), -1)
+    side = dr.select(value_to_level > 0, tracer.backend.Float(1), -1)
     if trace.side is not None:  # hits at crossings are at a root
         newton_step, side = dr.zeros(type(newton_step)), trace.side
     # Rays without a hit may have t = inf: they are evaluated at their origin.
     t = dr.maximum(dr.select(is_hit, trace.t, 0) + newton_step, 0)
     position = dr.fma(vector(t), d, o)
     if has_jumps:
-        sample = _sample_where(prepared, position, trace.value, d, is_smooth)
+        sample = _sample_where(tracer, position, trace.value, d, is_smooth)
     else:
-        sample = prepared.sample(position)
+        sample = tracer.sample(position)
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
     # A field may have another normal for shading than its gradient.
     shading_normal = normal if sample.shading_normal is None else sample.shading_normal
-    uncertainty = _uncertainty(prepared, sample.gradient, t, sample.value, sample.value_error)
+    uncertainty = _uncertainty(tracer, sample.gradient, t, sample.value, sample.value_error)
     # Second movement: along the gradient, by the distance to the level to first order.
-    correction = prepared.levels.offset_to_nearest(sample.value) / gradient_norm
+    correction = tracer.levels.offset_to_nearest(sample.value) / gradient_norm
     correction = dr.select(gradient_norm > 0, dr.clip(correction, -reach, reach), 0)
     # If f is farther from the level than before, a facet may lie between, behind which f does not
     # concern this surface.
@@ -187,17 +187,17 @@ def _refine_hits(prepared: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         normal=orient_normal(shading_normal, d, side),
         ray_offset=RAY_OFFSET * uncertainty,
         value=sample.value,
-        evaluations=trace.evaluations + dr.select(is_smooth, prepared.backend.UInt32(1), 0),
+        evaluations=trace.evaluations + dr.select(is_smooth, tracer.backend.UInt32(1), 0),
         is_hole_filling=is_smooth & has_jumps,
-        is_on_section=prepared.backend.Bool(False),
-        isoline_index=prepared.backend.UInt32(0),
+        is_on_section=tracer.backend.Bool(False),
+        isoline_index=tracer.backend.UInt32(0),
     )
     if not has_jumps:
         return hit
-    return dr.select(trace.at_jump, _hit_on_facet(prepared, o, d, trace, hit), hit)
+    return dr.select(trace.at_jump, _hit_on_facet(tracer, o, d, trace, hit), hit)
 
 
-def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
+def _sample_where(tracer: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active: Mask) -> Sample:
     """Return the `Sample` of f at points p (3,) on active lanes: value, bound of its rounding
     error, gradient and shading normal. All of these are 0 on other lanes. The sample has no bounds
     of f in the neighborhood of p.
@@ -208,12 +208,12 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
     The evaluation is skipped if no lane is active. Evaluating a mesh with holes takes longer than
     tracing a ray, and most rays hit a triangle or nothing.
     """
-    real, vector = prepared.backend.Float, prepared.backend.Array3f
+    real, vector = tracer.backend.Float, tracer.backend.Array3f
 
     def sample_all(_: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return value, error bound, gradient and shading normal at all points p. The argument, the
         state before, is not used: it has the same four numbers."""
-        sample = prepared.sample_with_branch(p, value)
+        sample = tracer.sample_with_branch(p, value)
         length = norm(sample.gradient)
         normal = dr.select(length > 0, sample.gradient / length, -d)
         shading = vector(normal if sample.shading_normal is None else sample.shading_normal)
@@ -226,7 +226,7 @@ def _sample_where(prepared: SurfaceTracer, p: Vec3, value: Real, d: Vec3, active
 
 
 def _hit_on_facet(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, trace: MarchResult, hit: SurfaceHit
 ) -> SurfaceHit:
     """Return the `SurfaceHit` of rays that hit a facet (a flat piece of the surface at which f
     jumps). The intersection with the facet's plane is exact up to rounding, so neither t nor the
@@ -241,12 +241,12 @@ def _hit_on_facet(
     set, and at least several roundings of the position.
     """
     t = dr.select(trace.at_jump, trace.t, 0)
-    position = dr.fma(prepared.backend.Array3f(t), d, o)
+    position = dr.fma(tracer.backend.Array3f(t), d, o)
     # 1 if the ray comes from the side of smaller values, else -1.
-    side = dr.mulsign(prepared.backend.Float(1), dr.dot(trace.gradient, d))
-    rounding = 4 * prepared.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
+    side = dr.mulsign(tracer.backend.Float(1), dr.dot(trace.gradient, d))
+    rounding = 4 * tracer.backend.machine_epsilon * (dr.max(dr.abs(o)) + t)
     # For |gradient| = 1, the tolerance of the value is a length.
-    tolerance = prepared.tolerance.value_tolerance(prepared.backend.Float(1), t)
+    tolerance = tracer.tolerance.value_tolerance(tracer.backend.Float(1), t)
     return replace(
         hit,
         t=t,
@@ -254,12 +254,12 @@ def _hit_on_facet(
         normal=orient_normal(trace.gradient, d, side),
         ray_offset=RAY_OFFSET * dr.maximum(tolerance, rounding),
         value=trace.value,
-        is_hole_filling=prepared.backend.Bool(False),
+        is_hole_filling=tracer.backend.Bool(False),
     )
 
 
 def _uncertainty(
-    prepared: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
+    tracer: SurfaceTracer, gradient: Vec3, t: Real, f: Real, error: Real = 0.0
 ) -> Real:
     """Return a distance: to first order, a point that the march accepts as a hit lies within this
     distance of the level set.
@@ -275,11 +275,9 @@ def _uncertainty(
     # A miss has t = inf, which would make the tolerance infinite.
     t = dr.select(dr.isfinite(t), t, 0)
     # Beside the bound `error`, the value itself is rounded by some units in its last place.
-    rounding = 2 * (error + 8 * prepared.backend.machine_epsilon * dr.abs(f))
-    value_tolerance = dr.maximum(prepared.tolerance.value_tolerance(gradient_norm, t), rounding)
-    return dr.select(
-        gradient_norm > 0, value_tolerance / gradient_norm, prepared.tolerance.distance
-    )
+    rounding = 2 * (error + 8 * tracer.backend.machine_epsilon * dr.abs(f))
+    value_tolerance = dr.maximum(tracer.tolerance.value_tolerance(gradient_norm, t), rounding)
+    return dr.select(gradient_norm > 0, value_tolerance / gradient_norm, tracer.tolerance.distance)
 
 
 def orient_normal(normal: Vec3, d: Vec3, side: Real) -> Vec3:
@@ -308,20 +306,20 @@ class CappedSolid:
     ray enters and leaves the convex volume at most once. A cap lies on the section if the ray
     enters or leaves the section there.
 
-    prepared: the tracer of the level sets f = low and f = high. An infinite bound has no level set.
+    tracer: the tracer of the level sets f = low and f = high. An infinite bound has no level set.
     low, high: the bounds of f; one of them may be infinite.
     """
 
-    prepared: SurfaceTracer
+    tracer: SurfaceTracer
     low: Real
     high: Real
 
     @classmethod
-    def of(cls, surface: TracedSurface, prepared: SurfaceTracer) -> CappedSolid:
+    def of(cls, surface: TracedSurface, tracer: SurfaceTracer) -> CappedSolid:
         """Return the solid that a surface with the option `side` describes, such as all points
         below its level.
 
-        prepared: the tracer of the same surface.
+        tracer: the tracer of the same surface.
 
         Raises:
             ValueError: the surface is a level set, not the boundary of a solid.
@@ -330,15 +328,15 @@ class CappedSolid:
             raise ValueError("this surface is not the boundary of a solid: give it a side")
         # The tracer's levels are the finite bounds, in increasing order, as the tracer computes
         # with them.
-        finite = iter(prepared.levels.values)
+        finite = iter(tracer.levels.values)
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
-        return cls(prepared, low, high)
+        return cls(tracer, low, high)
 
     def _contains(self, p: Vec3) -> Mask:
         """Return the mask of points p (3,) of the volume that belong to the solid."""
-        value = self.prepared.sample(p).value
+        value = self.tracer.sample(p).value
         # `level_counts` leaves out other components if only the largest one is drawn.
-        return (value >= self.low) & (value <= self.high) & self.prepared.level_counts(p)
+        return (value >= self.low) & (value <= self.high) & self.tracer.level_counts(p)
 
     def intersect(
         self, o: Vec3, d: Vec3, t_max: Real, active: Mask, side: Real = 0.0
@@ -355,14 +353,14 @@ class CappedSolid:
         at t = 0 with the normal along the ray, which takes it to the right side without bending it.
         So going in and going out always alternate, and no light is lost at the sharp edges of caps.
         """
-        zero = self.prepared.backend.Float(0)
-        t_enter, t_leave = self.prepared.clip(o, d, zero, t_max)
+        zero = self.tracer.backend.Float(0)
+        t_enter, t_leave = self.tracer.clip(o, d, zero, t_max)
         meets_volume = active & (t_enter < t_leave)
         t_enter = dr.select(meets_volume, t_enter, 0)
         # If only the largest connected component is drawn, rounding may leave in doubt on some rays
         # which points belong to it. Such rays are not resolved, and run out of steps in
         # `_meet_levels`.
-        is_resolved = self.prepared.is_resolved(o, t_leave)
+        is_resolved = self.tracer.is_resolved(o, t_leave)
         starts_inside = (
             meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
         )
@@ -395,17 +393,17 @@ class CappedSolid:
         out_along_ray = dr.select(hits_exit_cap | (side < 0), zero + 1, -1)
         # On the wrong side, the normal is along the ray.
         normal = out_along_ray * d
-        if self.prepared.volume is not None:
+        if self.tracer.volume is not None:
             cap_normal = orient_normal(
-                self.prepared.volume.outward_normal(position), d, out_along_ray
+                self.tracer.volume.outward_normal(position), d, out_along_ray
             )
             normal = dr.select(is_on_wrong_side, normal, cap_normal)
-        ray_offset = zero + RAY_OFFSET * self.prepared.tolerance.distance
+        ray_offset = zero + RAY_OFFSET * self.tracer.tolerance.distance
         on_section = hit.is_on_section
         # The cap is on the section if the section, not another part of the volume, ends the ray
         # there.
-        if self.prepared.section is not None:
-            t_section_enter, t_section_leave = self.prepared.section.clip(o, d, zero, t_max)
+        if self.tracer.section is not None:
+            t_section_enter, t_section_leave = self.tracer.section.clip(o, d, zero, t_max)
             on_section = dr.select(
                 hits_exit_cap,
                 t_section_leave <= t_leave,
@@ -430,24 +428,24 @@ class CappedSolid:
         enter it at a point of the solid, and rays that start in the solid and leave the volume
         before t_max. All other active rays are tested against the level sets.
         """
-        t_enter, t_leave = self.prepared.clip(o, d, self.prepared.backend.Float(0), t_max)
+        t_enter, t_leave = self.tracer.clip(o, d, self.tracer.backend.Float(0), t_max)
         meets_volume = active & (t_enter < t_leave)
         t_enter = dr.select(meets_volume, t_enter, 0)
         # Rays for which rounding leaves in doubt what belongs to the solid are not resolved;
         # `occluded` counts them as hits.
-        is_resolved = self.prepared.is_resolved(o, t_leave)
+        is_resolved = self.tracer.is_resolved(o, t_leave)
         starts_inside = (
             meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
         )
         hits_cap = starts_inside & ((t_enter > 0) | (t_leave < t_max))
         # All other rays are tested from t = 0 to t_max.
-        return hits_cap | self.prepared.occluded(o, d, 0, t_max, active & ~hits_cap)
+        return hits_cap | self.tracer.occluded(o, d, 0, t_max, active & ~hits_cap)
 
     def _meet_levels(self, o: Vec3, d: Vec3, t_max: Real, active: Mask) -> SurfaceHit:
         """Find the first hits of rays o + t d, 0 <= t <= t_max, with the level sets inside the
         volume. Returns a `SurfaceHit` whose normals point out of the solid: toward smaller f at the
         lower bound, and toward larger f at the upper one."""
-        hit = intersect_surface(self.prepared, o, d, t_max, active)
+        hit = intersect_surface(self.tracer, o, d, t_max, active)
         is_at_low = dr.abs(hit.value - self.low) < dr.abs(hit.value - self.high)
         normal = dr.select(is_at_low, -hit.normal, hit.normal)
         return replace(hit, normal=normal)
@@ -456,4 +454,4 @@ class CappedSolid:
         """Return the points o + t d (3,) of rays with the origins o and directions d; o where t is
         not finite."""
         t = dr.select(dr.isfinite(t), t, 0)
-        return dr.fma(self.prepared.backend.Array3f(t), d, o)
+        return dr.fma(self.tracer.backend.Array3f(t), d, o)

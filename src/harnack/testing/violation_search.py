@@ -253,8 +253,8 @@ def _sample(field: Field, points: FloatArray, precision: Precision, closely: boo
     closely: whether to sample without truncation error.
     """
     backend = choose_backend(precision)
-    prepared = field.evaluator(backend)
-    evaluator = exactly_sampled(prepared, backend) if closely else prepared
+    evaluator = field.evaluator(backend)
+    evaluator = exactly_sampled(evaluator, backend) if closely else evaluator
     return evaluator.evaluate(to_vector3(backend, points, "points"))
 
 

@@ -47,10 +47,10 @@ _NEWTON_STEPS, _NEWTON_STEPS_OF_SUMS = 4, 3
 _PARAMETER_FREE: FieldCache[bool] = FieldCache()
 
 
-def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
+def needs_derivatives(tracer: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     """Return whether rays, levels or the field's parameters have derivatives enabled.
 
-    prepared: the surface, with the levels and the field.
+    tracer: the surface, with the levels and the field.
     o, d: (3,) origins and directions of the rays.
 
     Raises:
@@ -58,20 +58,20 @@ def needs_derivatives(prepared: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
             the facets at which the field jumps, and the derivative of that is not known here; zero
             would be wrong.
     """
-    field = prepared.field
+    field = tracer.field
     # Plain data has no derivatives; other attributes may hide some, which raises an error. (None:
     # the memory has a single entry for each field.)
     if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         refuse_hidden_parameters(field)
-    parameters = differentiable_parameters(prepared.field)
+    parameters = differentiable_parameters(tracer.field)
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
-    if field_has_derivatives and prepared.evaluator.jumps is not None:
-        name = type(prepared.field).__name__
+    if field_has_derivatives and tracer.evaluator.jumps is not None:
+        name = type(tracer.field).__name__
         raise NotImplementedError(
             f"hits of a field with jumps cannot be differentiated by its parameters: detach "
             f"those of this {name} (derivatives by rays and levels are attached)"
         )
-    rays_and_levels: list[Any] = [o, d, *prepared.levels.values]
+    rays_and_levels: list[Any] = [o, d, *tracer.levels.values]
     return field_has_derivatives or any(dr.grad_enabled(p) for p in rays_and_levels)
 
 
@@ -100,27 +100,25 @@ class _NoDerivative(dr.CustomOp):
             )
 
 
-def refuse_derivative(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, result_name: str, value: Any
-) -> Any:
+def refuse_derivative(tracer: SurfaceTracer, o: Vec3, d: Vec3, result_name: str, value: Any) -> Any:
     """Return the array `value`, whose derivative is not known (and zero would be wrong). In reverse
     mode an error is raised if its derivative is used; in forward mode the derivative is NaN.
 
-    prepared, o, d: the surface, and the origins and directions (3,) of the rays; `value` depends on
+    tracer, o, d: the surface, and the origins and directions (3,) of the rays; `value` depends on
         these.
     result_name: the name of the result, for the message.
     """
-    sources = [o, d, *prepared.levels.values, *differentiable_parameters(prepared.field)]
+    sources = [o, d, *tracer.levels.values, *differentiable_parameters(tracer.field)]
     return dr.custom(_NoDerivative, value, result_name, sources)
 
 
 def attach_derivatives(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
     """Return the ray parameters t of hits, refined up to rounding, with derivatives attached; and
     the normals (3,) at these points.
 
-    prepared: the surface.
+    tracer: the surface.
     o, d: (3,) origins and directions of the rays, possibly with derivatives.
     end: how the rays ended.
     normal: (3,) the unit normals of the trace, which are kept if there is no hit.
@@ -131,34 +129,34 @@ def attach_derivatives(
     depend on the level.
     """
     # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
-    t, is_hit, prepared = end.t, end.status == int(RayStatus.HIT), prepared.hit_surface(end)
-    if prepared.evaluator.jumps is not None:
-        t = _on_plane(prepared, o, d, end)
+    t, is_hit, tracer = end.t, end.status == int(RayStatus.HIT), tracer.hit_surface(end)
+    if tracer.evaluator.jumps is not None:
+        t = _on_plane(tracer, o, d, end)
         is_hit &= ~end.at_jump
-    backend = prepared.backend
+    backend = tracer.backend
     with dr.suspend_grad():
         t_hit = dr.select(is_hit, t, 0)
         origin, direction = dr.detach(o), dr.detach(d)
         steps = _NEWTON_STEPS
-        accuracy = prepared.evaluator.variable_accuracy
+        accuracy = tracer.evaluator.variable_accuracy
         if accuracy is not None:
             # Truncation is as large as the tolerance, and its derivative may be much larger.
             steps = _NEWTON_STEPS_OF_SUMS
             # Hits are sampled without truncation; other rays do not matter (0 is the coarsest).
             scale = dr.select(is_hit, backend.Float(EXACT), 0)
-            prepared = replace(prepared, evaluator=accuracy.at(scale))
+            tracer = replace(tracer, evaluator=accuracy.at(scale))
         for _ in range(steps):
             x = dr.fma(backend.Array3f(t_hit), direction, origin)
-            sample = prepared.sample(x)
+            sample = tracer.sample(x)
             # The level minus f, and the derivative of f along the ray: Newton's step.
-            offset = prepared.levels.offset_to_nearest(sample.value)
+            offset = tracer.levels.offset_to_nearest(sample.value)
             slope = dr.dot(sample.gradient, direction)
             step = dr.select(is_hit & (slope != 0), offset / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
-            limit = 4 * prepared.tolerance.distance
+            limit = 4 * tracer.tolerance.distance
             t_hit = t_hit + dr.clip(step, -limit, limit)
         x = dr.fma(backend.Array3f(t_hit), direction, origin)
-        sample = prepared.sample(x)
+        sample = tracer.sample(x)
         slope = dr.dot(sample.gradient, direction)
         length = norm(sample.gradient)
         normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
@@ -167,25 +165,25 @@ def attach_derivatives(
     # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
     # same point without derivatives.
     change = dr.dot(sample.gradient, point - x)
-    if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(prepared.field)):
+    if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(tracer.field)):
         # f depends on parameters, too: its own derivative has all of them.
-        value = prepared.evaluator.differentiable_value(point)
+        value = tracer.evaluator.differentiable_value(point)
         change = value - dr.detach(value)
-    change = change - _change_of_nearest(prepared, sample.value)
+    change = change - _change_of_nearest(tracer, sample.value)
     return dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t), normal
 
 
-def _on_plane(prepared: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
+def _on_plane(tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
     """Return the ray parameters t at which rays o + t d ended. At hits on facets, t has the
     derivative of the parameter at which the ray meets the facet's plane.
 
-    prepared: the surface. end: how the rays ended.
+    tracer: the surface. end: how the rays ended.
     """
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
         # At a hit on a facet, `end.gradient` is the facet's normal.
         slope = dr.dot(end.gradient, dr.detach(d))
-    x = dr.fma(prepared.backend.Array3f(t_hit), d, o)
+    x = dr.fma(tracer.backend.Array3f(t_hit), d, o)
     # A zero with a derivative: that of the distance of a point at fixed t from the plane.
     change = dr.dot(end.gradient, x - dr.detach(x))
     return _with_derivative(end.t, change, slope, end.at_jump)
@@ -201,17 +199,17 @@ def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> R
     return dr.replace_grad(t, -change * dr.select(is_attached, 1 / slope, 0))
 
 
-def _change_of_nearest(prepared: SurfaceTracer, f: Real) -> Real:
+def _change_of_nearest(tracer: SurfaceTracer, f: Real) -> Real:
     """Return a zero that carries a derivative: that of the level nearest to f on each lane. It is
     level - detach(level).
 
-    prepared: the surface, with its levels.
+    tracer: the surface, with its levels.
     f: values of the field's function.
     """
-    nearest, change = dr.inf, prepared.backend.Float(0)
-    for level in prepared.levels.values:
+    nearest, change = dr.inf, tracer.backend.Float(0)
+    for level in tracer.levels.values:
         with dr.suspend_grad():
-            single = Levels((dr.detach(level),), prepared.levels.period)
+            single = Levels((dr.detach(level),), tracer.levels.period)
             gap = single.gaps(f).nearest
             is_nearest = gap < nearest
             nearest = dr.select(is_nearest, gap, nearest)

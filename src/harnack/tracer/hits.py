@@ -199,19 +199,19 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     """Trace rays, and return their hits as Dr.Jit arrays. The arrays carry derivatives if the rays
     were given as Dr.Jit arrays, and rays, levels or field have derivatives enabled."""
     backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
-    prepared = surface.for_rays(count).tracer(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
-    if not prepared.field.traits.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
-        prepared = replace(prepared, uses_ray_queue=True)
+    tracer = surface.for_rays(count).tracer(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    if not tracer.field.traits.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
+        tracer = replace(tracer, uses_ray_queue=True)
     # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
-        end, hits, doubt = _first_hits(prepared, *(dr.detach(array) for array in rays.arrays))
+        end, hits, doubt = _first_hits(tracer, *(dr.detach(array) for array in rays.arrays))
         if doubt is not None:
-            hits = _with_searched_distances(prepared, hits, doubt)
-    if not rays.is_numpy and needs_derivatives(prepared, o, d):
-        t, normal = attach_derivatives(prepared, o, d, end, hits.normal)
+            hits = _with_searched_distances(tracer, hits, doubt)
+    if not rays.is_numpy and needs_derivatives(tracer, o, d):
+        t, normal = attach_derivatives(tracer, o, d, end, hits.normal)
         # Results without a known derivative raise an error if it is used.
         normal, value, uncertainty = (
-            refuse_derivative(prepared, o, d, name, array)
+            refuse_derivative(tracer, o, d, name, array)
             for name, array in (
                 ("normal", normal), ("value", hits.value), ("uncertainty", hits.uncertainty),
             )
@@ -262,24 +262,24 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
 
 
 def _first_hits(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, near: Real, far: Real
 ) -> tuple[MarchResult, Hits, _DistanceDoubt | None]:
     """Trace rays o + t d from t = near to t = far, without derivatives.
 
-    prepared: the surface.
+    tracer: the surface.
 
     Returns three results: the ends of rays as the tracer gives them; the `Hits` made from them; and
     for each hit whether it may be due to rounding alone. The third is None if there can be no such
     hits.
     """
-    backend = prepared.backend
-    end = prepared.first_hit(o, d, near, far)
+    backend = tracer.backend
+    end = tracer.first_hit(o, d, near, far)
     is_hit = end.status == int(RayStatus.HIT)
     length = norm(end.gradient)
     normal = dr.select(is_hit & (length > 0), end.gradient / length, 0)
     # The index of the facet or patch; -1 for none.
     index = dr.full(backend.Int32, -1, dr.width(end.status))
-    if prepared.evaluator.jumps is not None:
+    if tracer.evaluator.jumps is not None:
         index = dr.reinterpret_array(backend.Int32, end.facet)  # NO_FACET becomes -1
     if end.patch is not None:
         index = dr.reinterpret_array(backend.Int32, end.patch)
@@ -291,8 +291,8 @@ def _first_hits(
     doubt = None
     # No other hits are doubtful: with `end.side` rays hit at roots only, and hits of a steep field
     # were tested on the other side of the level.
-    if end.side is None and not prepared.evaluator.is_steep:
-        doubt = _DistanceDoubt.of(prepared, o, end.t, length, uncertainty)
+    if end.side is None and not tracer.evaluator.is_steep:
+        doubt = _DistanceDoubt.of(tracer, o, end.t, length, uncertainty)
         # The distance as if several sheets of the surface met there.
         doubtful_uncertainty = _SHEET_COUNT * doubt.distance - doubt.tolerance
         uncertainty = dr.select(doubt.is_doubtful, doubtful_uncertainty, uncertainty)
@@ -323,11 +323,11 @@ class _DistanceDoubt:
 
     @classmethod
     def of(
-        cls, prepared: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
+        cls, tracer: SurfaceTracer, o: Vec3, t: Real, steepness: Real, uncertainty: Real
     ) -> _DistanceDoubt:
         """Determine which hits are doubtful, and their first-order distances.
 
-        prepared: the surface, with its tolerance.
+        tracer: the surface, with its tolerance.
         o, t: origins (3,) of the rays and ray parameters of the hits.
         steepness: |grad f| at the hits.
         uncertainty: the length that rounding adds to the tolerance, to first order.
@@ -335,9 +335,9 @@ class _DistanceDoubt:
         # Rays without a hit have t = inf.
         t = dr.select(dr.isfinite(t), t, 0)
         size = max_norm(o) + t
-        tolerance = prepared.tolerance.value_tolerance(steepness, t) / steepness
+        tolerance = tracer.tolerance.value_tolerance(steepness, t) / steepness
         limit = fmax(
-            _DOUBT_FRACTION * tolerance, _DOUBT_ROUNDINGS * prepared.backend.machine_epsilon * size
+            _DOUBT_FRACTION * tolerance, _DOUBT_ROUNDINGS * tracer.backend.machine_epsilon * size
         )
         return cls(size, tolerance, tolerance + uncertainty, uncertainty > limit)
 
@@ -364,18 +364,18 @@ class _SearchDistance:
     length: Real
 
 
-def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _DistanceDoubt) -> Hits:
+def _with_searched_distances(tracer: SurfaceTracer, hits: Hits, doubt: _DistanceDoubt) -> Hits:
     """Return the hits, with the uncertainty of the most doubtful ones replaced. Around each of
     these the surface is searched for; its new uncertainty is the distance within which the surface
     was found, less the tolerance.
 
-    prepared: the surface.
+    tracer: the surface.
     doubt: which hits are doubtful, and how far the surface may be from them to first order. Only
         where this distance is more than 8 tolerances is the surface searched for.
 
     All arrays of the hits are evaluated. If there is no such hit, nothing is searched.
     """
-    backend, evaluator = prepared.backend, prepared.evaluator
+    backend, evaluator = tracer.backend, tracer.evaluator
     is_far = doubt.is_doubtful & (doubt.distance > _SEARCH_TOLERANCES * doubt.tolerance)
     # Whether any hit is to be searched: lanes of `is_far` write a 1. This is computed by the kernel
     # that computes the hits, and needs no other one.
@@ -390,7 +390,7 @@ def _with_searched_distances(prepared: SurfaceTracer, hits: Hits, doubt: _Distan
         sampled = evaluator
         if evaluator.patches is not None:
             sampled = evaluator.patches.patch(dr.reinterpret_array(backend.UInt32, hit.part))
-        return _SearchDistance(seen_distance(backend, sampled, prepared.levels, hit.doubtful))
+        return _SearchDistance(seen_distance(backend, sampled, tracer.levels, hit.doubtful))
 
     doubtful = Doubtful(hits.position, hits.normal, doubt.size, doubt.distance)
     searched = compute_on_active(
@@ -419,7 +419,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     Raises RuntimeError if the device's hits of a sample of the rays differ from those of Dr.Jit.
     """
     count = rays.count
-    prepared = surface.tracer(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    tracer = surface.tracer(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     # A device needs every array at full width: single numbers are repeated for each ray.
     lanes = {
         name: array + dr.zeros(type(array), count)
@@ -430,7 +430,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     def compute(o: Vec3, d: Vec3, near: Real, far: Real) -> dict[str, Any]:
         """Return the arrays of `Hits` by name, for rays o + t d from t = near to t = far."""
         # Of the three results, [1] is the `Hits`.
-        return vars(_first_hits(prepared, o, d, near, far)[1])
+        return vars(_first_hits(tracer, o, d, near, far)[1])
 
     directions = to_numpy(lanes["d"])
 
@@ -440,7 +440,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
         pair = Hits(**expected), Hits(**computed)
         return _compare_hits(*pair, directions[rows], surface.hit_tolerance)
 
-    arrays = evaluate_on_device(find_device(), compute, lanes, prepared, differences)
+    arrays = evaluate_on_device(find_device(), compute, lanes, tracer, differences)
     return _as_numpy(Hits(**arrays), count)
 
 

@@ -148,13 +148,13 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
     """
     domain = None if field.traits.is_global else field.domain
     backend = choose_backend("double")
-    prepared = None if domain is None else domain.upload(backend)
+    uploaded_domain = None if domain is None else domain.upload(backend)
 
     def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return points (n, 3) in the domain near the given ones, and the distances (n,) between
         the two."""
         distances = np.zeros(len(points))
-        if domain is None or prepared is None:
+        if domain is None or uploaded_domain is None:
             return points, distances
         is_outside = ~domain.contains_points(points)
         if not is_outside.any():
@@ -162,10 +162,10 @@ def _projection_to_domain(field: Field) -> Callable[[FloatArray], tuple[FloatArr
         points_outside = points[is_outside]
         uploaded = to_vector3(backend, points_outside)
         # A little farther than the boundary, because of rounding.
-        depth = (1 + 1e-9) * to_numpy(prepared.signed_distance(uploaded)) + 1e-12 * np.abs(
+        depth = (1 + 1e-9) * to_numpy(uploaded_domain.signed_distance(uploaded)) + 1e-12 * np.abs(
             points_outside
         ).max()
-        moved = points_outside - depth[:, None] * to_numpy(prepared.outward_normal(uploaded))
+        moved = points_outside - depth[:, None] * to_numpy(uploaded_domain.outward_normal(uploaded))
         inner = points.copy()
         inner[is_outside] = moved
         # Rounded up, so that the distance is an upper bound.
@@ -180,12 +180,12 @@ def _distance_beyond(volume: Volume) -> Callable[[FloatArray], FloatArray]:
     """Return a function of points (n, 3) that returns lower bounds (n,) of their distances from the
     volume; they are negative inside the volume."""
     backend = choose_backend("double")
-    prepared = volume.upload(backend)
+    uploaded = volume.upload(backend)
 
     def beyond(points: FloatArray) -> FloatArray:
         """Return lower bounds (n,) of the distances of points (n, 3) from the volume, with a margin
         for rounding."""
-        distance = to_numpy(prepared.signed_distance(to_vector3(backend, points)))
+        distance = to_numpy(uploaded.signed_distance(to_vector3(backend, points)))
         rounding = 64 * float(np.finfo(np.float64).eps) * (1 + float(np.abs(points).max()))
         return np.broadcast_to(distance, len(points)) - rounding
 

@@ -89,15 +89,15 @@ class HitTolerance:
         if self.distance == 0 and self.value == 0 and self.per_length == 0:
             raise ValueError("tolerance must be positive: a level set is never met exactly")
 
-    def upload(self, backend: Backend) -> PreparedHitTolerance:
+    def upload(self, backend: Backend) -> DeviceHitTolerance:
         """Return this tolerance as Dr.Jit numbers of a backend that kernels take as parameters. So
         another tolerance compiles no new kernel."""
         numbers = (self.distance, self.per_length, self.value)
-        return PreparedHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
+        return DeviceHitTolerance(*(dr.opaque(backend.Float, number) for number in numbers))
 
 
 @dataclass(frozen=True)
-class PreparedHitTolerance:
+class DeviceHitTolerance:
     """A `HitTolerance` as Dr.Jit numbers that kernels take as parameters. f is the function whose
     level is the surface.
 
@@ -585,7 +585,7 @@ class _Bisection:
 
 
 def refine_crossing(
-    evaluator: Evaluator, levels: Levels, tolerance: PreparedHitTolerance, path: Ray,
+    evaluator: Evaluator, levels: Levels, tolerance: DeviceHitTolerance, path: Ray,
     contact: Contact, active: Mask,
 ) -> tuple[Real, Vec3, Any]:  # fmt: skip
     """Find where rays cross the level more exactly, by bisection where needed.

@@ -35,9 +35,9 @@ from harnack.tracer.level_contact import (
     CONTACT_TOLERANCE,
     AcceptedPoint,
     Contact,
+    DeviceHitTolerance,
     Hysteresis,
     JumpTest,
-    PreparedHitTolerance,
     RayStatus,
     test_jump,
 )
@@ -284,7 +284,7 @@ class March:
 
     backend: Backend
     rule: LevelRule
-    tolerance: PreparedHitTolerance
+    tolerance: DeviceHitTolerance
     max_steps: Any
     over_relaxation: float
     hysteresis: Hysteresis | None = None

@@ -25,7 +25,7 @@ import drjit as dr
 from harnack.backend.elementary import fmax, fmin, safe_norm
 from harnack.backend.loops import loop_while_active
 from harnack.enclosures.samples import Ray
-from harnack.tracer.level_contact import PreparedHitTolerance, RayStatus
+from harnack.tracer.level_contact import DeviceHitTolerance, RayStatus
 from harnack.tracer.level_rule import PlainLevels
 from harnack.tracer.march import March, MarchState
 
@@ -74,7 +74,7 @@ class PixelCones:
     """Cones around rays o + t d, |d| = 1, that may touch a level set of a function f. The cover is
     the layer around the surface whose thickness is the radius of the cone.
 
-    prepared: the tracer of the level set.
+    tracer: the tracer of the level set.
     radius: the radius of a cone per unit of t.
     bounding_balls: (middle, depth, size): the common center of a ball of radius `depth` inside the
         extent of the surface and of a ball of radius `size` around the extent; None for an
@@ -82,7 +82,7 @@ class PixelCones:
     solid: (low, high) for a solid {low <= f <= high}; None for a surface with two sides.
     """
 
-    prepared: SurfaceTracer
+    tracer: SurfaceTracer
     origin: Vec3
     direction: Vec3
     radius: Real
@@ -103,30 +103,30 @@ class PixelCones:
         second surface within the cover of the first. A ray that has used all samples in the cover
         counts as covered in part.
         """
-        backend, prepared = self.prepared.backend, self.prepared
+        backend, tracer = self.tracer.backend, self.tracer
         real = backend.Float
-        path = Ray(self.origin, self.direction, prepared.proofs)
+        path = Ray(self.origin, self.direction, tracer.proofs)
         start, t_end = self._clip()
         end = fmin(t_end, real(t_max))
         state = MarchState.at(
-            backend, start, end, active, has_detail=prepared.evaluator.variable_accuracy is not None
+            backend, start, end, active, has_detail=tracer.evaluator.variable_accuracy is not None
         )  # fmt: skip
         margin = (
             _START_MARGIN
-            if prepared.evaluator.variable_accuracy is None
+            if tracer.evaluator.variable_accuracy is None
             else _START_MARGIN_APPROXIMATE
         )
         # The march ends a small margin outside of the cover: the tolerance grows with the cone.
         # (`distance` and `value` of the tolerance are 0, `per_length` is the margin.)
-        tolerance = PreparedHitTolerance(real(0), margin * self.radius, real(0))
-        rule = PlainLevels(prepared.levels)
-        march_options = rule, tolerance, prepared.max_steps, prepared.over_relaxation
+        tolerance = DeviceHitTolerance(real(0), margin * self.radius, real(0))
+        rule = PlainLevels(tracer.levels)
+        march_options = rule, tolerance, tracer.max_steps, tracer.over_relaxation
         march = March(backend, *march_options, cone_radius=self.radius)
-        now = march.advance(prepared.evaluator, path, real(end), state)
+        now = march.advance(tracer.evaluator, path, real(end), state)
         # A hit is a point at which the ray comes to the cover.
         is_hit = now.status == int(RayStatus.HIT)
         begin = dr.select(is_hit, now.proved_to, 0)
-        gap = prepared.levels.offset_to_nearest(now.value)
+        gap = tracer.levels.offset_to_nearest(now.value)
         # The level that was reached, and 1 or -1 if the ray comes from larger or smaller f.
         level, side = now.value + gap, dr.select(gap < 0, real(1), -1)
 
@@ -134,7 +134,7 @@ class PixelCones:
             """Return the height over the surface at parameters t, in radii of the cone, and its
             derivative along the ray."""
             # With the accuracy at which the march has ended.
-            evaluator, accuracy = prepared.evaluator, prepared.evaluator.variable_accuracy
+            evaluator, accuracy = tracer.evaluator, tracer.evaluator.variable_accuracy
             if accuracy is not None and now.accuracy_scale is not None:
                 evaluator = accuracy.at(now.accuracy_scale)
             sample = evaluator.evaluate(dr.fma(backend.Array3f(t), self.direction, self.origin))
@@ -175,7 +175,7 @@ class PixelCones:
 
         The height is inf where the gradient or t is 0.
         """
-        period = self.prepared.levels.period
+        period = self.tracer.levels.period
         offset = value - level
         if period is not None:
             offset = dr.fma(dr.round(offset / period), -period, offset)
@@ -203,9 +203,9 @@ class PixelCones:
         h about m = 0. Then it contains h u for every unit vector u. So (1 + a) C = C + a C contains
         C moved by any vector of length a h.
         """
-        real = self.prepared.backend.Float
+        real = self.tracer.backend.Float
         start, end = real(0), real(dr.inf)
-        if self.bounding_balls is not None and self.prepared.volume is not None:
+        if self.bounding_balls is not None and self.tracer.volume is not None:
             # Around `middle`, a ball of radius `depth` lies in the extent, and a ball of radius
             # `size` contains it.
             middle, depth, size = self.bounding_balls
@@ -214,11 +214,11 @@ class PixelCones:
             farthest = (safe_norm(middle - self.origin) + size) * (1 + 2 * self.radius)
             factor = 1 + self.radius * farthest / depth
             o = (self.origin - middle) / factor + middle
-            start, end = self.prepared.volume.clip(o, self.direction, start, end)
+            start, end = self.tracer.volume.clip(o, self.direction, start, end)
             start, end = start * factor, end * factor
         # Outside of the region f must not be evaluated.
-        if self.prepared.region is not None:
-            start, end = self.prepared.region.clip(self.origin, self.direction, start, end)
+        if self.tracer.region is not None:
+            start, end = self.tracer.region.clip(self.origin, self.direction, start, end)
         return real(start), real(end)
 
 

@@ -115,19 +115,19 @@ class _SearchState:
 
 
 def find_crossings(
-    prepared: SurfaceTracer, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, t_min: Real, t_max: Real, k: int
 ) -> CrossingArrays:
     """Find the first k crossings of rays o + t d, |d| = 1, for t_min <= t <= t_max, with the
-    surface `prepared`.
+    surface of `tracer`.
 
     `Hysteresis`, the rule by which a crossing is counted, states the guarantees and proves them. A
     ray is marched from one crossing to the next without a new start: what is known of f at a
     crossing is used after it, and the ray may reach and leave levels any number of times.
     """
-    backend = prepared.backend
+    backend = tracer.backend
     real, vector, count = backend.Float, backend.Array3f, backend.UInt32
     # (True: all rays are active.)
-    march, path, start, end, state = prepared.begin_march(o, d, t_min, t_max, True, crosses=True)
+    march, path, start, end, state = tracer.begin_march(o, d, t_min, t_max, True, crosses=True)
     n = max(dr.width(array) for array in (path.origin, path.direction, start, end))
     # Crossing j of ray i is at i k + j.
     first_slot = dr.arange(count, n) * k
@@ -137,7 +137,7 @@ def find_crossings(
     before, behind = dr.zeros(real, n * k), dr.zeros(real, n * k)
     gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
     dr.make_opaque(t, side, before, behind, gradient, facets)
-    jumps = prepared.evaluator.jumps
+    jumps = tracer.evaluator.jumps
     tracer = None if jumps is None else JumpTracer(march, jumps, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
@@ -146,7 +146,7 @@ def find_crossings(
         its ray."""
         next_state, facet = now, None
         if tracer is None or now.sheets is None:
-            after = march.advance(prepared.evaluator, path, end, now.now)
+            after = march.advance(tracer.evaluator, path, end, now.now)
         else:
             # The tracer's own state includes that of the march.
             walk = tracer.advance(now.sheets)
@@ -202,7 +202,7 @@ def find_crossings(
         gather_vectors(backend, o, ray_indices),
         gather_vectors(backend, d, ray_indices),
     )
-    t, gradient, extra_evaluations = prepared.refined_crossings(
+    t, gradient, extra_evaluations = tracer.refined_crossings(
         origins, directions, roots, dr.isfinite(t)
     )
     evaluations = final.evaluations + dr.block_reduce(dr.ReduceOp.Add, extra_evaluations, k)
@@ -333,10 +333,10 @@ def trace_crossings(
         derivatives enabled.
     """
     backend, o, d = rays.backend, rays.origin, rays.direction
-    prepared = surface.tracer(backend, crosses=True)
+    tracer = surface.tracer(backend, crosses=True)
     with dr.suspend_grad():
         detached_o, detached_d, near, far = (dr.detach(array) for array in rays.arrays)
-        arrays = find_crossings(prepared, detached_o, detached_d, near, far, k)
+        arrays = find_crossings(tracer, detached_o, detached_d, near, far, k)
         is_found = dr.isfinite(arrays.t)
         length = norm(arrays.gradient)
         normal = dr.select(length > 0, arrays.gradient / length, 0)
@@ -344,7 +344,7 @@ def trace_crossings(
     ray = dr.arange(backend.UInt32, dr.width(arrays.t)) // k
     o, d = gather_vectors(backend, o, ray), gather_vectors(backend, d, ray)
     t, end = arrays.t, arrays.end
-    if differentiable and needs_derivatives(prepared, o, d):
+    if differentiable and needs_derivatives(tracer, o, d):
         with dr.suspend_grad():
             # The crossings as if each were the end of a ray of its own. The attributes that are
             # zero (`value`, `tolerance_excess` and `evaluations`) are not used.
@@ -353,9 +353,9 @@ def trace_crossings(
             ends = MarchResult(
                 t, zero, arrays.gradient, zero, zero, status, arrays.sheet, arrays.side
             )
-        t, normal = attach_derivatives(prepared, o, d, ends, normal)
-        normal = refuse_derivative(prepared, o, d, "normal", normal)
-        end = refuse_derivative(prepared, o, d, "traced_to", end)
+        t, normal = attach_derivatives(tracer, o, d, ends, normal)
+        normal = refuse_derivative(tracer, o, d, "normal", normal)
+        end = refuse_derivative(tracer, o, d, "traced_to", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(arrays.side)
     index = dr.reinterpret_array(backend.Int32, arrays.sheet)  # NO_FACET becomes -1

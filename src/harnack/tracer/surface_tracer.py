@@ -1,4 +1,4 @@
-"""`SurfaceTracer`: a surface prepared on a backend, with methods that trace rays to it. The surface
+"""`SurfaceTracer`: a surface on a backend, with methods that trace rays to it. The surface
 consists of the points at which a function f (a field) takes one of given values, the levels. f may
 jump at facets, flat pieces of surface such as the triangles of a mesh; or the field may be a union
 of patches, many level sets in boxes of their own.
@@ -24,8 +24,8 @@ from harnack.tracer.branch_tracker import BranchTracker
 from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (
     Contact,
+    DeviceHitTolerance,
     Hysteresis,
-    PreparedHitTolerance,
     RayStatus,
     refine_crossing,
 )
@@ -256,7 +256,7 @@ class _EndStatus:
 
 @dataclass(frozen=True)
 class SurfaceTracer:
-    """A surface prepared on a backend, with methods that trace rays o + t d to it. The surface
+    """A surface on a backend, with methods that trace rays o + t d to it. The surface
     consists of the points of `volume` at which f, the function of `field`, takes one of the
     `levels`. The methods can be called while Dr.Jit records a kernel, except with `uses_ray_queue`.
 
@@ -290,7 +290,7 @@ class SurfaceTracer:
     levels: Levels
     volume: Volume | None
     proofs: EnclosureKinds
-    tolerance: PreparedHitTolerance
+    tolerance: DeviceHitTolerance
     max_steps: Any
     over_relaxation: float
     require_crossing: bool = False

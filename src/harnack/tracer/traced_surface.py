@@ -199,7 +199,7 @@ class TracedSurface:
 
     def with_call_cache(self, *, begins: bool = False) -> TracedSurface:
         """Return this surface with a cache for a single call of the library, so that its field,
-        extent and cells are prepared only once. Copies made by `dataclasses.replace` share the
+        extent and cells are made only once. Copies made by `dataclasses.replace` share the
         cache. A surface that has a cache is returned unchanged.
 
         begins: whether to start with an empty cache even if the surface has one, as users may have
