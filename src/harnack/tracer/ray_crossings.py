@@ -138,20 +138,20 @@ def find_crossings(
     gradient, facets = dr.zeros(vector, n * k), dr.full(count, NO_FACET, n * k)
     dr.make_opaque(t, side, before, behind, gradient, facets)
     jumps = tracer.evaluator.jumps
-    tracer = None if jumps is None else JumpTracer(march, jumps, path, start, end)
+    jump_tracer = None if jumps is None else JumpTracer(march, jumps, path, start, end)
 
     def advance(now: _SearchState) -> _SearchState:
         """Bring each active ray to its next crossing, to the next jump of f, or to its end. Returns
         the state after it. A crossing is written to the arrays outside, in the next free place of
         its ray."""
         next_state, facet = now, None
-        if tracer is None or now.sheets is None:
+        if jump_tracer is None or now.sheets is None:
             after = march.advance(tracer.evaluator, path, end, now.now)
         else:
             # The tracer's own state includes that of the march.
-            walk = tracer.advance(now.sheets)
+            walk = jump_tracer.advance(now.sheets)
             next_state = _SearchState(None, walk, now.count)
-            after, facet = tracer.finish(walk)
+            after, facet = jump_tracer.finish(walk)
         contact = after.contact
         assert contact is not None
         is_at_crossing = now.active & (after.status == int(RayStatus.HIT))
@@ -189,8 +189,8 @@ def find_crossings(
         )
 
     begin = _SearchState(state, None, dr.zeros(count, n))
-    if tracer is not None:
-        begin = _SearchState(None, tracer.begin(state), dr.zeros(count, n))
+    if jump_tracer is not None:
+        begin = _SearchState(None, jump_tracer.begin(state), dr.zeros(count, n))
     walk = loop_while_active(begin, advance, "harnack crossings")
     final = walk.now
     ray_indices, zero = dr.arange(count, n * k) // k, real(0)
