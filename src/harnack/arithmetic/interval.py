@@ -6,8 +6,10 @@ as both ends (`lower is upper`), so that operations on it are done once. A unit 
 last place.
 
 A single rounding in float32 that violates an enclosure may cause a missed hit; therefore ranges are
-rounded outwards. By measurement, a path is best divided into four pieces for blobs, which then
-share the search for nearby blobs, and not divided for formulas (`PathRestriction.piece_count`).
+rounded outwards. Where ranges of a function's derivatives are computed along a path, a piece of a
+ray, the path can be cut into pieces with ranges of their own (`PathRestriction.piece_count`). By
+measurement four pieces are best for sums of blobs, as all pieces share the search for nearby blobs,
+and one piece for formulas.
 """
 
 from __future__ import annotations

@@ -390,7 +390,10 @@ def _make_cacheless_pickler(base: Any) -> Callable[..., Any]:
                 return reduced
             refuse_imports_within(function)
             self.words |= words_of(function)
-            # Of cloudpickle's arguments, the code and the closure are kept, but not the globals.
+            # cloudpickle describes a function by a constructor, its arguments, and `rest`: a state,
+            # and what sets the state. Of the arguments, code and closure are kept. In place of
+            # cloudpickle's dictionary of globals, the function gets that of its rebuilt module,
+            # into which the state then sets the globals that it names.
             _, (code, _, _, _, closure), *rest = cast("tuple[Any, ...]", reduced)
             return function_in, (self.space(function.__globals__), code, closure), *rest
 

@@ -305,7 +305,8 @@ def _power(base: Any, exponent: Any) -> Any:
     an int as exponent are also defined for negative bases.
 
     Raises:
-        OverflowError: both are constants, and the power is not real.
+        OverflowError: both are constants, and the power is complex, or larger than the largest
+            float.
     """
     if isinstance(exponent, float) and exponent.is_integer():
         exponent = int(exponent) if abs(exponent) < 2**31 else exponent

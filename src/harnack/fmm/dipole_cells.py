@@ -233,6 +233,7 @@ class DipoleCells:
         Returns the sums, and the new state of the caller.
         """
         in_cell, in_tree = add
+        # Scales below 1 mean the same as 1, the accuracy of cells, also where the tree is used.
         lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
         sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, extra_state)
         tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, extra_state, lanes & ~is_valid)

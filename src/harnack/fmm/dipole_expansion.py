@@ -363,15 +363,17 @@ class _ClusterExpansion:
         radius: the radius of the ball.
 
         Truncation. `tail_factors` bounds the terms of degree j > p of the polynomial, where
-        p = `DEGREE`; its ratio c grows with l, so the last one is used for all. At q times the
-        radius, q <= 1, the truncation error is at most q^(p+1) times as much as on the sphere, and
-        that of the gradient q^p times as much.
+        p = `DEGREE`; the ratio c of its geometric series grows with l, so that of the largest l is
+        used for all. At q times the radius, q <= 1, the truncation error is at most q^(p+1) times
+        as much as on the sphere, and that of the gradient q^p times as much.
 
-        Rounding, in double precision. Each product of a coefficient passes through fewer than 2^10
-        roundings, including its shifts to smaller cells. The sum of the absolute values of all
-        products, with those of the harmonics of the ball, is below 2^23 norms[l-1]/r^(l+1) (tests
-        compute it). So the value, and the gradient times the radius, are off by at most 2^-20 of
-        norms[l-1]/r^(l+1).
+        Rounding, in double precision. For a multipole term of degree l, the value in the ball is a
+        sum of products: of a moment, an irregular harmonic at r (these two make a coefficient), and
+        a harmonic at the point of the ball. Each product passes through fewer than 2^10 roundings,
+        including those of shifts to smaller cells. The sum of the absolute values of all products
+        is below 2^23 norms[l-1]/|r|^(l+1) (a test computes it). As a rounding is at most 2^-53 of
+        its number, the value, and the gradient times the radius, are off by at most 2^-20 of
+        norms[l-1]/|r|^(l+1).
         """
         # powers: of the radius. inverse_power: 1/|r|^(l+1) in the loop over l; q_power: q^(p+1).
         inverse = dr.rsqrt(dr.squared_norm(r))

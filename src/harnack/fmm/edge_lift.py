@@ -323,8 +323,8 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge in the record `row` to the sums, given as a state (`SourceSums.to_state`). A
-        record that is padding has the direction 0 and adds nothing. Returns the new state. `unit`
-        bounds the rounding of a coordinate."""
+        record that is padding has the direction 0 and adds nothing. Returns the new state."""
+        # `unit` of the enclosing function bounds the rounding of a coordinate.
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         # On other lanes the terms are 0.

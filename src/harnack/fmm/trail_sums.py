@@ -627,9 +627,10 @@ class LiftedTrails:
             """The new state, after the edges in the record `row` have been added. It holds the
             product of factors, the gradient, the least squared distance, the bound of the rounding,
             s4 and s5 (quantities of `SourceSums` that bound the remainder of Taylor's formula)."""
-            # L is the length of an edge, d its distance from x, w c its Biot and Savart field.
-            # `factor_rounding` bounds the rounding of a record's factors, and `unit` that of a
-            # coordinate; `steep_rounding` is STEEP_ROUNDINGS unit roundoffs.
+            # The symbols and proofs are those of `sum`: L is the length of an edge, d its distance
+            # from x, w c its Biot and Savart field. `factor_rounding` bounds the rounding of a
+            # record's factors, and `unit` that of a coordinate; `steep_rounding` is STEEP_ROUNDINGS
+            # unit roundoffs.
             product, g, min_square, rounding, s4, s5 = state
             product = LiftedProduct(*product)
             a = view_vertex(self._vertex(row, 0), frame, x)
@@ -638,7 +639,8 @@ class LiftedTrails:
             # nearest the least d^2, and longest the largest L.
             for k in range(self.edges_per_record):
                 p, q = self._vertex(row, k), self._vertex(row, k + 1)
-                # length is L, with a sign for the order of the ends' indices; 0 if there is no edge
+                # inverse is 1/L^2; length is L, with a sign for the order of the ends' indices, and
+                # 0 if there is no edge.
                 inverse, length = self._edge(row, k)
                 b = view_vertex(q, frame, x)
                 re, im = edge_factor_of_views(a, b, length)
@@ -654,10 +656,13 @@ class LiftedTrails:
                 longest = fmax(longest, dr.abs(length))
                 weighted = weighted + dr.select(is_edge, integral * square, 0)
                 a = b
+            # The least d, less its rounding.
             distance = fmax(dr.sqrt(nearest) - 2 * unit, 0)
-            # (unit + STEEP_ROUNDINGS roundoffs L) times the bound of the sum of |field|
+            # (unit + STEEP_ROUNDINGS roundoffs L) times the bound of the sum of |field|, which is
+            # the root, by Cauchy and Schwarz.
             steep = dr.fma(steep_rounding, longest, unit) * dr.sqrt(total * weighted)
             rounding = rounding + (steep + factor_rounding)
+            # s4 grows by the sum of L w/4, and s5 by that of 3 L w/(16 d), 3/16 being 0.1875.
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
             return (product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5)
 

@@ -129,7 +129,7 @@ def distances_from_triangles(points: FloatArray, corner: FloatArray) -> FloatArr
 class Edges:
     """The distinct edges among n pairs of indices of points. A pair (a, b) and its reverse (b, a)
     are the same edge. `edge_of_pair` is the index of each pair's edge, and `multiplicity` the
-    number of pairs that an edge is.
+    number of pairs of each edge.
 
     vertices: (k, 2) the two ends of each of the k edges, the lower index first, in lexicographic
         order.
@@ -158,9 +158,9 @@ class Edges:
         )
 
     def run_twice_alike(self, pairs: IntArray) -> BoolArray:
-        """The mask (k,) of the edges that exactly two pairs are, both in the same direction. If the
-        pairs are the half-edges of faces, the two faces at such an edge do not agree which side of
-        the surface is which.
+        """The mask (k,) of the edges of which there are exactly two pairs, both in the same
+        direction. If the pairs are the half-edges of faces, the two faces at such an edge do not
+        agree which side of the surface is which.
 
         pairs: (n, 2) the pairs of which these are the edges.
         """

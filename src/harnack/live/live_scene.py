@@ -363,6 +363,7 @@ class LiveScene:
             # The tube around the curve has to follow the edited curve.
             objects = _studio_objects(_with_loops(content, curve, controls.curves), settings)
             curve = _curve_of(objects)
+        # Each surface gets a hit tolerance that fits the stage.
         objects = [self._fitted(body) for body in objects]
         if controls.cut_volume is not None:
             objects = [
@@ -371,11 +372,13 @@ class LiveScene:
             ]
         if curve is None:
             return objects
-        # Vertices are passed as Dr.Jit arrays. From the numbers of NumPy arrays the field
-        # would choose among its proofs, and so among kernels.
+        # Vertices are passed as Dr.Jit arrays. With NumPy arrays the field would choose its proofs
+        # by their numbers, and after an edit other kernels would have to be compiled.
         backend = choose_backend("single")
         loops = curve.loops if controls.curves is None else controls.curves
         field = SolidAngle([to_vector3(backend, loop) for loop in loops])
+        # A copy shares the cache of its original, which holds data of the old field; `begins` gives
+        # it an empty one.
         return [
             replace(body, surface=replace(body.surface, field=field).with_call_cache(begins=True))
             if body.surface.field is curve

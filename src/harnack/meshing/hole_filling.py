@@ -369,8 +369,8 @@ def _min_area_triangulation(
     """Triangulate a polygon with the smallest area. Returns the triangles (n - 2, 3) by indices of
     vertices; None if existing edges exclude every triangulation. The method is dynamic programming:
     cost[i, k] is the smallest area of a triangulation of the part from position i to position k. It
-    is found from the shorter parts, by trying every third corner m of the triangle at the diagonal
-    from i to k.
+    is found from the shorter parts, by trying all positions m between i and k for the third corner
+    of the triangle that has the diagonal from i to k as a side.
 
     x: (v, 3) all vertices.
     polygon: (n,) indices of vertices.

@@ -5,17 +5,18 @@ and values between for an open one. A "stage" is one way of repairing; a "fillin
 consists of new triangles that close a hole; the "boundary edges" around a hole have a single face.
 
 Stages are tried in turn, from the one that keeps most to the one that always gives a result: all
-triangles stay and holes are filled; bodies that overlap are united (`bodies`; for a surface that
-passes through itself, pieces of its faces, `joined_pieces`); only valid triangles stay
-(`mesh_cleaning`); triangles that share no vertices are joined at near corners; everything is
-remeshed: the surface on which the winding number of the mesh is 1/2 is extracted from signs.
+triangles stay and holes are filled; bodies that overlap are united (`bodies`), and a surface that
+passes through itself is cut into pieces, of which the outer ones are joined (`joined_pieces`); only
+valid triangles stay (`mesh_cleaning`); triangles that share no vertices are joined at near corners;
+everything is remeshed: the surface on which the winding number of the mesh is 1/2 is extracted from
+signs.
 
 That a result is closed is not enough. The solid that it bounds is compared with the winding number
 of the input, and the result is rejected if they disagree (`intended_solid`). Holes are filled in
-one of two ways. Smooth fillings, of minimal bending (`hole_filling`), are proved only to intersect
-neither the mesh nor each other. Harmonic fillings (`harmonic_filling`) are parts of the surface on
-which the winding number is 1/2 modulo 1, and it is proved which surface they approximate; but they
-have a dent where the surface was round.
+one of two ways. Of smooth fillings, which have minimal bending (`hole_filling`), it is proved that
+they intersect neither the mesh nor each other, and nothing else. Harmonic fillings
+(`harmonic_filling`) are parts of the surface on which the winding number is 1/2 modulo 1, and it is
+proved which surface they approximate; but they have a dent where the surface was round.
 """
 
 from __future__ import annotations

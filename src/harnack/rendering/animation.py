@@ -264,11 +264,15 @@ def _cameras(
         _orbited(replace(camera, box=box, target=camera.target or center), orbit * s, rotation)
         for camera, s, rotation in zip(cameras, steps.tolist(), rotations, strict=True)
     ]
-    # Frame each camera by itself, with zoom 1. For that, points are only rotated until `up` is z.
+    # Frame each camera by itself, with zoom 1. `pose` needs coordinates whose z is `up`, and a map
+    # from the user's coordinates to them. Here they are rotated only, so that distances stay the
+    # user's; on the stage of a picture they are scaled and moved as well.
     chooses_distance = [camera.position is None and camera.distance is None for camera in framed]
     poses = [
         replace(camera, zoom=1.0).pose(
-            points @ rotation.T, size, lambda local, rotation=rotation: local @ rotation.T
+            points @ rotation.T,
+            size,
+            lambda user_points, rotation=rotation: user_points @ rotation.T,
         )
         for camera, rotation in zip(framed, rotations, strict=True)
     ]

@@ -23,9 +23,10 @@ scenes that are put together in Python.
 Mitsuba's own integrators trace rays to Mitsuba's shapes only. A level set is represented by a proxy
 mesh of two triangles, each of which is a single point, so they would draw nothing of it and say
 nothing. Mitsuba calls no method of a shape while it renders, so `mitsuba.render` is replaced by a
-function that checks the scene first and warns. `harnack.render` uses its own path tracer if the
-integrator asks for the same light, leaves scenes without level sets to Mitsuba, and raises an error
-for all other scenes.
+function that checks the scene first and warns. `harnack.render` draws a scene by its own path
+tracer if the scene's integrator computes the same light, as Mitsuba's `path` does. All other scenes
+are left to Mitsuba, unless they have level sets that their integrator cannot see: these raise an
+error.
 
 Finding a hit and describing it to Mitsuba (`SurfaceInteraction`) are separate, since Mitsuba's next
 release lets Python define shapes.
@@ -113,9 +114,8 @@ def equivalent_path_tracer(mi: Any, scene: Any) -> PathTracer | None:
     tracers, and either the scene has no level sets of harnack or the integrator can see them.
 
     Raises:
-        ValueError: the scene has level sets of harnack, and its integrator asks for something that
-            a path tracer without media does not compute, such as light in a medium or channels of
-            its own.
+        ValueError: the scene has level sets of harnack, and its integrator computes something that
+            a path tracer without media does not, such as light in a medium or channels of its own.
     """
     integrator = scene.integrator()
     if integrator is None:

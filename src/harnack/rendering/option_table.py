@@ -266,7 +266,8 @@ NAMES_ELSEWHERE: Mapping[str, str] = {
     "domain": "clip", "solid": "side",
 }  # fmt: skip
 """Names in other programs and of arguments of fields, and the option that does the same here."""
-# Such names of what is no option.
+# Further names in other programs, and in place of an option the text with which messages describe
+# what does the same here.
 _ARGUMENTS_ELSEWHERE = {
     **dict.fromkeys(("filename", "output", "file"), '"path", the second argument'),
     **dict.fromkeys(
@@ -345,15 +346,16 @@ def complete_options(verb: str, keywords: Mapping[str, Any]) -> dict[str, Any]:
 
 def refuse_unknown(verb: str, keywords: Mapping[str, Any]) -> None:
     """Raise TypeError for keywords that are no options of the function `verb` of the library, such
-    as "render". The message suggests an option: the one that has the meaning of this name in other
-    programs, or one with a similar name. If there is none, it lists the options of the function."""
+    as "render". Of an option of other functions, the message names these (`refuse_others`). Of
+    other names it suggests what has this name in other programs, an option or another argument, or
+    else an option with a similar name. If there is none, it lists the options of the function."""
     refuse_others(verb, keywords)
     for name in keywords:
         if name not in BY_NAME:
             names = [option.name for option in options_of(verb)]
             option = NAMES_ELSEWHERE.get(name.lower())
-            other_name = f'"{option}"' if option else _ARGUMENTS_ELSEWHERE.get(name.lower())
-            hint = f"; did you mean {other_name}?" if other_name else did_you_mean(name, names)
+            suggestion = f'"{option}"' if option else _ARGUMENTS_ELSEWHERE.get(name.lower())
+            hint = f"; did you mean {suggestion}?" if suggestion else did_you_mean(name, names)
             raise TypeError(
                 f"{verb} has no option {name!r}{hint or '; it has ' + ', '.join(names)}"
             )

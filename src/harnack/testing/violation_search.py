@@ -561,8 +561,9 @@ def _slope_ratio(
     gap: (k,) the differences between f(y) and the nearer end of the range.
 
     Proof. f - lower is positive and harmonic on the ball of radius `margin` about y. So by
-    Harnack's inequality |grad f(y)| <= n (f(y) - lower)/margin; likewise for upper - f. If there is
-    a singularity in the ball, the left side grows faster than the right one beside it.
+    Harnack's inequality in n dimensions |grad f(y)| <= n (f(y) - lower)/margin; likewise for
+    upper - f. The search finds singularities in the ball because the left side of the inequality
+    grows faster towards them than the right side.
     """
     slope = np.maximum(np.linalg.norm(at_y.gradient, axis=1) - at_y.gradient_error, 0)
     return np.where(gap > 0, slope * margin / (promise.dimension * gap), -np.inf)

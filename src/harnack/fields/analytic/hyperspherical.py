@@ -233,7 +233,8 @@ class HypersphericalHarmonic(Field):
         return self._range.low, self._range.high
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        """The evaluator of f. As it holds Python numbers only, it is the same for every backend and
+        every plan (what the evaluator is used for)."""
         del backend, plan
         return _HypersphericalEvaluator(self.degree, self._orders, self._range)
 

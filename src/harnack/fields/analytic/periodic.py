@@ -154,8 +154,8 @@ class ExtensionBounds:
         )
 
     def ball(self, f: Real, slope: Real) -> HarmonicBall:
-        """A ball of R^4 about a point p, with bounds on it of the harmonic extension F of f to four
-        dimensions.
+        """The ball B(p, R) of R^4 about a point p, R being `radius`, with a range of F on it. F is
+        the harmonic extension of f to four dimensions; the range follows from f and its slope at p.
 
         f: the value at p.
         slope: |grad f(p)|.
@@ -233,12 +233,14 @@ class EigenfunctionSum(Field):
         E t <= E^2/(2 h H) + h H t^2/2   (since 2 a b <= a^2 + b^2),
 
     so the larger constant and E^2/(2 h H), added to the value's error, cover the error of Taylor's
-    formula with a rounded gradient. For the harmonic ball of radius R the effect of E is at most
-    E R. The proofs on balls allow for a part of it themselves: they use the slope in units of
-    4 (f - lower)/R, where `lower` is the lower bound on the ball, with an error of 16 u of this
-    unit (`enclosures.free_radius.condition_rounding`; u is the unit roundoff). As f - lower is
-    about H R^2/2 or more, that part is about 32 u H R^2; half of it is left as a margin. Only the
-    rest of E R is added.
+    formula with a rounded gradient. For the harmonic ball of radius R the effect of E is at most E
+    R. The proofs on balls already allow for some of this effect: they use the slope in units of 4
+    (f - lower)/R, where `lower` is the lower bound on the ball, and allow for an error of 16 u of
+    this unit (`enclosures.free_radius.condition_rounding`; u is the unit roundoff). Along the
+    length R this is 64 u (f - lower). f - lower is at least the number D of `ExtensionBounds` (but
+    for the cap at the end of its proof), and so about H R^2/2 or more. So the proofs allow for
+    about 32 u H R^2. Half of this allowance is relied on: E R - 16 u H R^2 is added to the value's
+    error, if it is positive.
 
     Raises:
         ValueError: terms that are not finite, or a sum that is constant.
@@ -257,8 +259,9 @@ class EigenfunctionSum(Field):
         self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)
         radius = self._extension.radius
-        # The part of the error E R that needs no addition, in units of u: 16 times 4 (f - lower),
-        # halved as a margin, where f - lower is about this minimum or more.
+        # The part of the error E R that need not be added to the value's error, in units of u. The
+        # proofs allow for 16 times 4 (f - lower), and f - lower is about this minimum or more; half
+        # of that, 32 times the minimum, is relied on.
         self._rounding_bound = 32 * min(
             0.5 * self.curvature * radius**2, self.max_gradient * radius
         )
@@ -285,7 +288,8 @@ class EigenfunctionSum(Field):
         return self.waves.largest_curvature
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        """The evaluator of f. As it holds Python numbers only, it is the same for every backend and
+        every plan (what the evaluator is used for)."""
         del backend, plan
         return _WaveSumEvaluator(
             self.terms, self.waves, self._extension, self._rounding, self._rounding_bound
@@ -350,8 +354,8 @@ class _WaveSumEvaluator(Evaluator):
     bounds: proved bounds of f and of its derivatives.
     extension: bounds of the harmonic extension of f on balls of R^4.
     rounding: bounds of the rounding of value and derivatives.
-    rounding_bound: the part of the error E R for which the proofs on balls allow themselves, in
-        units of the unit roundoff.
+    rounding_bound: the part of the error E R that is not added to the value's error, as the proofs
+        on balls allow for it, in units of the unit roundoff.
     """
 
     terms: tuple[Term, ...]
@@ -384,7 +388,7 @@ class _WaveSumEvaluator(Evaluator):
         alternatives = (self.extension.ball(value, gradient_norm_bound), lipschitz)
         # The effects of the gradient's rounding error E: E^2/(2 h H) for Taylor's formula, with the
         # bound H of second derivatives and h = `_SLOPE_SHARE`; and for the harmonic ball of radius
-        # R the part of E R that the proofs on balls do not allow for themselves.
+        # R what E R exceeds `rounding_bound` by.
         error += gradient_error * (gradient_error * (0.5 / (_SLOPE_SHARE * curvature)))
         error += fmax(gradient_error * self.extension.radius - self.rounding_bound * epsilon, 0)
         return Sample(value, gradient, promises, error, alternative_promises=alternatives)

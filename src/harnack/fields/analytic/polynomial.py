@@ -241,12 +241,14 @@ class HarmonicPromises:
 
         If f has a term of degree 1 or 2, the radius goes from `center_radius` at r = 0 to
         `boundary_radius` at r = 1. Otherwise it is proportional to r, because f vanishes to a high
-        order at the origin. Near a z axis along which f vanishes to the order m > 2, the range on
-        the ball is about proportional to (rho + R)^m (r + R)^(l-m) with the degree l. The best R is
-        then 2/((m-2)/rho + (l-m)/r) if rho is a small fraction of r, as it is there.
+        order at the origin. If f also vanishes along the z axis, to the order m > 2 (then `axial`
+        is set), the range on a ball near this axis is about proportional to (rho + R)^m (r +
+        R)^(l-m), where l is the degree. Steps are longest where range/R^2 is smallest; for a small
+        rho/r this is about at R = 2/((m-2)/rho + (l-m)/r).
         """
         if self.lowest_degree < 3:
-            # Never below the smaller of the two radii.
+            # Never below the smaller of the two radii: proportional to r if that is the radius at
+            # the center, else falling linearly in r.
             if self.center_radius < self.boundary_radius:
                 return fmax(self.boundary_radius * r, self.center_radius)
             return fmax(
@@ -311,7 +313,8 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The evaluator of f, which holds Python numbers only, for any backend and plan."""
+        """The evaluator of f. As it holds Python numbers only, it is the same for every backend and
+        every plan (what the evaluator is used for)."""
         del backend, plan
         return _SolidHarmonicsEvaluator(self._weights, self._axis, self._size, self._promises)
 

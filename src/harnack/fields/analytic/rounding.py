@@ -290,8 +290,9 @@ class WaveRounding:
         """Compute the bounds of the rounding errors that `evaluate_terms` makes when it sums these
         terms of waves."""
         common_frequencies = [_common_frequency(terms, axis) for axis in range(3)]
-        # Each list has four numbers: a constant, and the factors of |x|, |y| and |z|.
-        value, gradient, total_slopes, hessian = ([0.0] * 4 for _ in range(4))
+        # Each list has four numbers: a constant, and the factors of |x|, |y| and |z|. They are of
+        # the attributes with these names: `slopes` bounds the whole error of the gradient.
+        value, gradient, slopes, hessian = ([0.0] * 4 for _ in range(4))
         value_sum, slope_sum, second_sum = 0.0, 0.0, 0.0
         for n, term in enumerate(terms):
             amplitude, vector = abs(term.amplitude), _wave_vector(term)
@@ -303,8 +304,10 @@ class WaveRounding:
                 slope_sum + amplitude * norm,
                 second_sum + second_size,
             )
+            # The rounding of products that counts as a move of the point is left out of the first
+            # result for axes, and is included in the second one.
             angle_error, axis_errors, other_errors = _term_roundings(term, common_frequencies)
-            _, all_axis_errors, _ = _term_roundings(term, (None, None, None))
+            _, whole_axis_errors, _ = _term_roundings(term, (None, None, None))
             # The first sum is exact.
             partial_sums = (value_sum, slope_sum, second_sum) if n else (0.0, 0.0, 0.0)
             # The added 2 and 6 are roundings of the factors that differentiation adds.
@@ -314,12 +317,17 @@ class WaveRounding:
             for axis in range(3):
                 value[axis + 1] += amplitude * axis_errors[axis]
                 gradient[axis + 1] += amplitude * norm * axis_errors[axis]
-                total_slopes[axis + 1] += amplitude * norm * all_axis_errors[axis]
-                hessian[axis + 1] += second_size * all_axis_errors[axis]
-        total_slopes[0] = gradient[0]
+                slopes[axis + 1] += amplitude * norm * whole_axis_errors[axis]
+                hessian[axis + 1] += second_size * whole_axis_errors[axis]
+        # A move is proportional to a coordinate, so the constants of both bounds are the same.
+        slopes[0] = gradient[0]
         moves = [0.0 if k is None else _product_rounding(k) for k in common_frequencies]
-        a, b, c, d = ((s[0], s[1], s[2], s[3]) for s in (value, gradient, total_slopes, hessian))
-        return cls((moves[0], moves[1], moves[2]), a, b, c, d)
+        value_bound, gradient_bound, slopes_bound, hessian_bound = (
+            (s[0], s[1], s[2], s[3]) for s in (value, gradient, slopes, hessian)
+        )
+        return cls(
+            (moves[0], moves[1], moves[2]), value_bound, gradient_bound, slopes_bound, hessian_bound
+        )
 
     def errors(self, p: Vec3, gradient: Vec3) -> tuple[Real, Real]:
         """Two bounds, of the errors of the computed value and of the computed gradient of the sum

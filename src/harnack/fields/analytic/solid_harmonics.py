@@ -205,8 +205,9 @@ def unit_hessian(l: int, m: int, rho: Any, z: Any, azimuth: float, removed_power
     """
 
     def power(n: int) -> Any:
-        """rho^n / rho^removed_power. If n < removed_power it is 1, since the factor before it is 0
-        then."""
+        """The power rho^(n - removed_power) of the distances `rho`, where `removed_power` is how
+        many factors rho the caller leaves out. For n < removed_power it is 1; the factor by which
+        it is multiplied below is 0 then."""
         return rho ** max(n - removed_power, 0)
 
     x, y = rho * math.cos(azimuth), rho * math.sin(azimuth)

@@ -222,16 +222,20 @@ def largest_gradient(l: int, m: int) -> float:  # noqa: E741
     where a is the polar angle.
 
     Without its constant factor, the harmonic is Q rho^m cos(m b), with the polynomial Q = Q_l^m of
-    z and r^2 (`solid_harmonics`). The components of the gradient along rho and z are cos(m b) times
-    the derivative of Q rho^m by rho and (l+m) Q_(l-1)^m rho^m; the component along the azimuth b is
-    -sin(m b) m Q rho^(m-1). So the length is at most the larger of the lengths of these two parts.
+    z and r^2 (`solid_harmonics`). The derivative of Q by rho is -rho Q', with Q' = Q_(l-1)^(m+1).
+    So the components of the gradient are cos(m b) (m Q - rho^2 Q') rho^(m-1) along rho, cos(m b)
+    (l+m) Q_(l-1)^m rho^m along z, and -sin(m b) m Q rho^(m-1) along the azimuth b. The first two
+    are one part and the last one another; as cos^2 + sin^2 = 1, the length of the gradient is at
+    most the larger of the lengths of these parts, without cos and sin.
     """
     if l == 0:
         return 0.0
     z, rho = polar_samples()
     # On the unit sphere r^2 is 1.
     q = Legendre(z, 1.0)
+    # Q and Q', divided by (2m-1)!! as `Legendre` does; for Q' it divides by (2m+1)!!.
     at_m, at_next = q(l, m), (2 * m + 1) * q(l - 1, m + 1)
+    # The components without cos and sin, divided by rho^(m-1) if m > 0.
     if m == 0:
         radial, axial, azimuthal = -rho * at_next, l * q(l - 1, 0), 0.0 * z
     else:

@@ -164,6 +164,8 @@ class SolidAngle(FieldWithCells):
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
         curves, self._differentiable_loops = _movable_loops(loops)
+        # net: the polygons as given. `_net_loops` and `_net_circles` are what remains after edges
+        # and circles that cancel each other have been removed.
         net, self.circles = validate_curves(curves)
         self._loops: Loops = tuple(_read_only(loop) for loop in net)
         self._net_loops: Loops = cancel_opposite_edges(self.loops) if self.loops else ()

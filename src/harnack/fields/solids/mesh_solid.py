@@ -140,22 +140,24 @@ class MeshSolid(Solid):
     sum of the signs of the crossings of the mesh with a ray along z
     (`tree.triangle_tree.signed_crossing`). It is right wherever the distance is more than its error
     e, also for rays through edges and vertices and for triangles without area. Each triangle that
-    counts as crossed has a point within rounding of the ray; the depth of this point along the ray
-    is compared with 0. Let C be a cylinder of that radius around the line of the ray. The ball of
-    radius e about the point x has no point of the surface. So the part of a triangle in C, which is
-    convex, lies in front of x or behind x as a whole, and its depth decides which. An edge that
-    meets C in front of x belongs to two triangles in front. For both, the same bits decide on which
-    side of the edge the ray passes, so that they cancel. All other edges are passed at a distance
-    greater than rounding. So the sum is that of a ray in general position. Normals of edges and
-    vertices, weighted by angles (Baerentzen and Aanaes 2005), would need no ray, but have no
-    reliable direction near triangles as thin as rounding.
+    counts as crossed has a point within a distance c < e of the ray, where c is of the size of
+    rounding; the depth of this point along the ray is compared with 0. Let C be the cylinder of
+    radius c around the line of the ray. The ball of radius e about the point x has no point of the
+    surface, and it divides C into a part in front of x and a part behind x. So the part of a
+    triangle in C, which is convex, lies in one of these as a whole, and its depth decides in which.
+    An edge that meets C in front of x belongs to two triangles in front. For both, the same bits
+    decide on which side of the edge the ray passes, so that they cancel. All other edges are passed
+    at a distance greater than rounding. So the sum is that of a ray in general position. Normals of
+    edges and vertices, weighted by angles (Baerentzen and Aanaes 2005), would need no ray, but have
+    no reliable direction near triangles as thin as rounding.
 
     If the nearest point lies inside a triangle, the triangle's normal decides the same without a
     ray. Proof. The ball about x through that point is free of the surface, so that x is on the side
     of the triangle that the normal tells. Suppose that rounding has mistaken a point on an edge for
-    an inner point. Then all other triangles at that edge lie at more than a right angle from x
-    (else they would be nearer), so that this triangle is the first that is met, turning around the
-    edge from x.
+    an inner point. Look along that edge: every other triangle at it makes more than a right angle
+    with the direction to x (else it would be nearer), and this triangle makes about a right angle.
+    So no other triangle lies between this one and x, and x is still on the side that its normal
+    tells.
 
     Raises:
         MeshError: a mesh that is not closed, whose faces do not agree on its two sides, that is

@@ -666,7 +666,8 @@ class _SegmentEvaluator(Evaluator):
     """The evaluator of one tube of a network: of the distance D from its segment minus its radius
     r. Each lane may have another segment.
 
-    boxes: the boxes of all tubes, of which only the center is used.
+    boxes: the boxes of all tubes. Only the center of all of them together is used, to which the
+        positions in records are relative.
     row: the record of the segment: its start, the radius of its tube, the vector from its start to
         its end, and 1 / length^2. Each entry is a Dr.Jit array.
 
