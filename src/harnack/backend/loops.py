@@ -278,8 +278,9 @@ def _run_queue(
         """Apply the body to the rays of all lanes. In each lane whose ray ends, store the result
         and take the next ray of the queue.
 
-        `next_position` is a counter in memory. `scatter_inc` adds 1 for each such lane and returns
-        the number before, so each lane gets a position of its own.
+        `next_position`, of the enclosing function, is a counter in memory: the next position in the
+        queue. `scatter_inc` adds 1 to it for each such lane and returns the number before, so each
+        lane gets a position of its own.
         """
         new_state = body(lane.state)
         is_ended = lane.active & ~new_state.active

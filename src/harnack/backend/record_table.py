@@ -135,8 +135,8 @@ class RecordTable:
         )
 
         def read_and_apply(i: Any, *state: Any) -> LoopValues:
-            """Apply `body` to the records of iteration i. Returns the index of the next iteration
-            and the new state."""
+            """Apply the caller's function `body` to the records of iteration i. Returns the index
+            of the next iteration and the new state."""
             for j in range(self.records_per_iteration):
                 state = body(self.read_record(i * self.records_per_iteration + j), state)
             return i + 1, *state

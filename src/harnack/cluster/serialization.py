@@ -287,6 +287,7 @@ def _file_digest(name: str) -> str | None:
             return None
         digest = hashlib.blake2b(digest_size=16)
         with open(name, "rb") as file:
+            # In blocks of a megabyte.
             while block := file.read(1 << 20):
                 digest.update(block)
         return digest.hexdigest()

@@ -194,6 +194,7 @@ def rounding_fingerprint() -> str:
 def _rounding(_name: str) -> str:
     """Return a hash of numbers that kernels of the chosen backend compute: functions that
     processors may round differently. _name: the backend's name, by which the hash is cached."""
+    # 4096 numbers from 0.01 to 40, arguments of the functions.
     x = dr.linspace(choose_backend().Float, 0.01, 40, 4096)
     s, c = dr.sincos(x)
     results = (dr.rcp(x), dr.rsqrt(x), s, c, dr.exp(-x), dr.log(x), dr.fma(s, c, x), dr.sqrt(x),

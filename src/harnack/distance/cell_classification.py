@@ -563,8 +563,8 @@ class CellClassifier:
         zero = dr.opaque(real, 0.0)  # keeps constant components of a gradient in the loop
 
         def body(y: Vec3, last: Real, k: Any) -> tuple[Any, ...]:
-            """Make one Newton step from y, at most as long as `radius`. Returns the new y, the
-            length of this step, and the new number of steps.
+            """Make one Newton step from y, at most as long as `radius` of `_newton_point`. Returns
+            the new y, the length of this step, and the new number of steps.
 
             last: the length of the step before.
             k: the number of steps so far.

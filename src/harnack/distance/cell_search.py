@@ -461,7 +461,7 @@ class _CellSearch:
 
             guess_point: the best point before, NaN for none.
 
-            The trees `coarse` and `tree`, and `marks`, are the parameters of `_search_in_kernel`.
+            `coarse`, `tree` and `marks` are the parameters of the enclosing function.
             """
             real, missing = backend.Float, backend.Array3f(FAR_SENTINEL)
             limit = safe_norm(guess_point - x)

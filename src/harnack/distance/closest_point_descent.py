@@ -146,7 +146,7 @@ class ClosestPointDescent:
             first_step: the first-order distance of the start from the level.
             last: the length of the step before.
             is_lost, is_far: masks of the lanes that failed, and of those whose closest point is
-                farther than `limit`.
+                farther from x than `limit`, the parameters of `newton`.
             k: the number of steps so far.
             active: whether the search goes on.
             """
@@ -481,6 +481,7 @@ class ClosestPointDescent:
             - y| and the radius of the ball on which f is smooth.
         rows: the rows of the Hessian at y. If None, they are computed.
         """
+        # uu, vv and uv are the second derivatives of f along the tangents u and v of the plane.
         plane = TangentPlane.of(state.gradient)
         to_x = x - state.y
         distance = dr.norm(to_x)

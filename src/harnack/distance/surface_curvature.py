@@ -266,6 +266,7 @@ class _Derivatives:
         real = self.backend.Float
         x, y, z = self.rows
         plane = TangentPlane.of(self.gradient)
+        # The second derivatives of f along the tangents u and v of the plane.
         uu, vv, uv = plane.restrict_hessian(self.rows)
         inverse_norm = 1 / plane.gradient_norm
         mean = 0.5 * (uu + vv) * inverse_norm

@@ -236,6 +236,7 @@ class _GreenCondition:
     def expansion_at_zero(self) -> tuple[Real, Real]:
         """Return k(0) and about k'(0). No proof relies on them."""
         # ln(1/q) in kappa, taken at q = sqrt(gap), about the root for slope 0.
+        # (Of gaps of 1e-12 or less it is just below 14.)
         log = clamp(-0.5 * dr.log(fmax(self.gap, 1e-12)), 0, 14)
         first = 3 * self.slope
         quadratic = dr.fma(GREEN_KERNEL_BOUND * self.spread, 2 + log, 5 * self.weight - 2 * first)

@@ -222,7 +222,7 @@ def allowed_movement(
 
     def movement(end: Real, sign: float) -> Real | None:
         """Return how far f may move to one end of the promised range; None if that end is infinite.
-        Where the result is NaN, the mask `is_valid` is cleared.
+        Where that is NaN, the mask `is_valid` of the enclosing function becomes False.
 
         end: the upper end, with sign 1, or the lower end, with sign -1.
         """

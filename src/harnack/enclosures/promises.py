@@ -295,6 +295,7 @@ class HarmonicBall(Promise):
         the constant 7.7/R^2 of the promise.
         """
         half = 0.5 * self.radius
+        # (1.0001 allows for rounding.)
         return TaylorRemainder(
             1.0001 * _SECOND_DERIVATIVE_BOUND * self._span(value) / (half * half), half
         )

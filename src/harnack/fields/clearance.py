@@ -116,8 +116,9 @@ def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
     """
 
     def clearance_outside(points: FloatArray) -> FloatArray:
-        """The clearances (n,) of points (n, 3) from the part of the level sets that lies outside of
-        `polytope`. For points outside of it they are those from all level sets."""
+        """Lower bounds (n,) of the distances of points (n, 3) to the part of the level sets that
+        lies outside of the polytope of `_clearance_outside`. For points outside of the polytope
+        they are those to all level sets."""
         # The depth is positive inside.
         depth = (polytope.offsets - points @ polytope.normals.T).min(axis=1)
         outside = depth <= 0

@@ -499,8 +499,10 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
     count_text = f"{len(points):,} points"
     if contents.normals is None:
         summary = f"{count_text} without faces, and no normals read: a point cloud"
+        # (None: neither normals nor areas.)
         return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
+    # (None: no areas.)
     return LoadedCloud(points, normals, None, f"{count_text} with normals, no faces: a point cloud")
 
 

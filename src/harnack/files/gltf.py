@@ -93,6 +93,7 @@ def _header(place: FileLocation, data: bytes) -> dict[str, Any]:
                 f"its header promises {max(length, size + 20):,} bytes, but the file has "
                 f"{len(data):,}: it is truncated"
             )
+        # The header begins behind the first 20 bytes.
         text = data[20 : 20 + size]
     try:
         header: Any = json.loads(text)

@@ -158,6 +158,7 @@ def read_metaballs(path: Path, data: bytes) -> Metaballs:
     is_grouped = counts == 6
     summary = f"{len(table):,} blobs"
     if not is_grouped.any():
+        # (None: the file names no groups.)
         return Metaballs(table[:, :3], radii, table[:, 4], None, f"{summary}, one group")
     if not is_grouped.all():
         raise lines.locations[int(np.argmin(is_grouped))].error(
@@ -366,6 +367,7 @@ def read_off(path: Path, data: bytes) -> FileGeometry:
     )
     faces = PolygonList(corners, sizes, rows.locations)
     check_indices(faces, count)
+    # (None: normals are not read.)
     return FileGeometry(path, vertices, None, faces)
 
 

@@ -173,8 +173,9 @@ def estimate_areas(
     radii = np.empty(len(positions))
 
     def find_neighbors(rows: slice) -> None:
-        """Find the neighbors of the points `rows` (stored in `nearest`), and half the distance of
-        each point from its farthest neighbor (stored in `radii`)."""
+        """Find the neighbors of the points `rows`, and half the distance of each point from its
+        farthest neighbor. They are stored in the arrays `nearest` and `radii` of the enclosing
+        function."""
         batch = order[rows]
         nearest[batch], distance = nearest_neighbors(tree, x[batch], neighbors)
         radii[position_of[batch]] = 0.5 * distance[:, -1]
@@ -236,6 +237,7 @@ def nearest_neighbors(tree: Any, points: FloatArray, count: int) -> tuple[IntArr
         CloudError: a point and all its neighbors lie within 1e-100.
     """
     distance, index = tree.query(points, k=min(count + 1, tree.n))
+    # The squares of such distances would underflow.
     if distance[:, -1].min() < 1e-100:
         raise CloudError(f"a point and its {count} neighbors all lie within 1e-100: remove some")
     # All points of the tree are different, so the nearest one found is the point itself.

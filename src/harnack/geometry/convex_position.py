@@ -183,6 +183,7 @@ def is_simple(x: FloatArray) -> bool:
         is_near &= lower[:, None, axis] <= upper[None, :, axis]
         is_near &= lower[None, :, axis] <= upper[:, None, axis]
     first, second = np.nonzero(is_near)
+    # In slices, to save memory.
     for begin in range(0, len(first), 100_000):
         i, j = first[begin : begin + 100_000], second[begin : begin + 100_000]
         clearance = segment_distance_lower_bound(x[i], ends[i], x[j], ends[j])
@@ -202,6 +203,8 @@ def segment_distance_lower_bound(
     angles to the line through the two points. It is valid whether or not the projections have
     converged; if they have, it is the distance.
     """
+    # Ericson's symbols: d1 and d2 are the vectors along the segments, r goes from p2 to p1, and a,
+    # b, c, e, f are inner products of these.
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     c, f = _dot(d1, r), _dot(d2, r)

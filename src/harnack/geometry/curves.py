@@ -336,6 +336,7 @@ def _check_edges(vertices: FloatArray, name: str, closed: bool) -> None:
         )
     size = float(np.abs(vertices).max())
     shortest = float(np.abs(edges).max(axis=1).min())
+    # Beyond these, products of lengths would overflow or underflow.
     if size > 1e100 or shortest < 1e-100:
         raise CurveError(
             f"{name} has coordinates up to {size:g} and an edge as short as {shortest:g}: "

@@ -304,7 +304,8 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
     index = np.empty((len(points), count), np.int32)
 
     def find_slice(rows: slice) -> None:
-        """Store the indices of the neighbors in `index`, for the rows of `points` in a slice."""
+        """Find the indices of the neighbors of the points in a slice of all points, and store them
+        in the array `index` of the enclosing function."""
         index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
     parallel_over_slices(find_slice, len(points))
@@ -337,7 +338,8 @@ def _move_along_normals(
     moved = np.empty_like(start)
 
     def move_slice(rows: slice) -> None:
-        """Store the moved points in `moved`, for the rows of `start` in a slice."""
+        """Move the points in a slice of `start`, and store them in `moved` (arrays of the enclosing
+        function)."""
         n, index = own_normals[rows], neighbors[rows]
         neighbor_normals, offsets = normals[index], points[index] - start[rows, None]
         # n . (p_j - x), the height of each neighbor above the point.
@@ -379,8 +381,8 @@ def _agreeing_weight(
     fraction = np.empty(len(start))
 
     def compute_slice(rows: slice) -> None:
-        """Store the results of `_agreeing_weight` in `fraction`, for the rows of `start` in a
-        slice."""
+        """Compute the results of `_agreeing_weight` for the points in a slice of `start`, and store
+        them in `fraction` (arrays of the enclosing function)."""
         n, index = own_normals[rows], neighbors[rows]
         offsets = points[index] - start[rows, None]
         # n . (p_j - x), the height of each neighbor above the point's tangent plane.
@@ -416,7 +418,8 @@ def _refit_normals(
     refitted = np.empty_like(normals)
 
     def refit_slice(rows: slice) -> None:
-        """Store the fitted normals in `refitted`, for the rows of `points` in a slice."""
+        """Fit normals at the points in a slice of `points`, and store them in `refitted` (arrays of
+        the enclosing function)."""
         index = neighbors[rows]
         offsets = points[index] - points[rows, None]
         cosine = np.einsum("mi,mki->mk", normals[rows], normals[index])

@@ -267,6 +267,7 @@ def _check_edges(mesh: PolygonFaces) -> None:
         )
     begin, end = mesh.corners, mesh.corners[mesh.next_corner]
     length = np.abs(mesh.vertices[begin] - mesh.vertices[end]).max(axis=1)
+    # The squares of such lengths would underflow.
     if (degenerate := np.flatnonzero(length < 1e-100)).size:
         k = degenerate[0]
         raise MeshError(

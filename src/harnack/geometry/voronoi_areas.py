@@ -122,9 +122,9 @@ class TangentVoronoi:
         neighbor_count = dr.opaque(index, count)
 
         def bisector(i: Any, active: Mask) -> _BisectorLine:
-            """The bisector line of neighbor i; for i from `neighbor_count` on, that of the image of
-            neighbor i - neighbor_count under reflection in the point. active: mask of lanes in
-            which it is needed."""
+            """The bisector line of neighbor i; for i from k on, where k is the number of neighbors,
+            that of the image of neighbor i - k under reflection in the point. active: mask of lanes
+            in which it is needed."""
             row = dr.select(i < neighbor_count, i, i - neighbor_count)
             neighbor_id = dr.gather(index, table, row * width + lane, active)
             position = [

@@ -785,8 +785,8 @@ def _sum(first: Quadratic, second: Quadratic, sign: int) -> Quadratic:
     or downwards (sign -1)."""
 
     def plus(x: Real, y: Real) -> Real:
-        """The sum of two coefficients, rounded to the side of `sign`; exact if one is the Python
-        number 0."""
+        """The sum of two coefficients, rounded up or down as `sign` says (1 for up); exact if one
+        is the Python number 0."""
         if _is_zero(y):
             return x
         # (0.0: no size besides that of the sum. The rounding of x and y is in them already.)

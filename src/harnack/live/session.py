@@ -141,7 +141,7 @@ class MessageHandler:
             """Send the progress from time to time.
 
             Raises:
-                Cancelled: the client cancelled the question `number` or is gone.
+                Cancelled: the client cancelled the question or is gone.
             """
             nonlocal last
             if self.is_gone or number in self._cancelled:

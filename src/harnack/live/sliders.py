@@ -76,6 +76,7 @@ class Slider:
         number = min(max(number, self.low), self.high)
         if self.step is None:
             return number
+        # (1e-9 steps count as rounding.)
         step_count = math.floor((number - self.low) / self.step + 1e-9)
         step_value = min(self.low + self.step * step_count, self.high)
         return number if abs(number - step_value) <= 1e-9 * self.step else step_value

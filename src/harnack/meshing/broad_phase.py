@@ -254,8 +254,9 @@ def _are_apart(a: Corners, b: Corners, shared: list[list[Mask]]) -> Mask:
 
     def by_edges_or_line(*arguments: Any) -> Mask:
         """Whether the two triangles are apart by the condition on edges or by the condition on a
-        line (`_are_apart`). arguments: the three corners of `a`; those of `b`; for each corner of
-        `a` whether it is shared; the same for `b`; and the number of shared corners."""
+        line (`_are_apart`). arguments: the three corners of the first triangle; those of the second
+        one; for each corner of the first one whether it is shared; the same for the second one; and
+        the number of shared corners."""
         first, second = cast("tuple[Corners, Corners]", (arguments[:3], arguments[3:6]))
         in_first, in_second, count = (list(arguments[6:9]), list(arguments[9:12]), arguments[12])
         may_pierce = _edge_may_pierce(first, second, _sides(first, second), in_second)

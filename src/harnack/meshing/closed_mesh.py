@@ -200,6 +200,7 @@ def extruded_manifold(
     def mapped(points: FloatArray) -> FloatArray:
         """Turn and scale points (n, 3) of the straight extrusion in proportion to their height."""
         z = points[:, 2] / scale
+        # c and s are the cosine and the sine of the angle of the turn.
         factor, c, s = 1 + growth * z, np.cos(rate * z), np.sin(rate * z)
         x, y = factor * points[:, 0], factor * points[:, 1]
         return np.column_stack([c * x - s * y, s * x + c * y, points[:, 2]])

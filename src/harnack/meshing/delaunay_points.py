@@ -318,6 +318,7 @@ def _off_walls(points: FloatArray, walls: tuple[FloatArray, FloatArray]) -> Floa
 
     walls: the lower and upper corners (3,) of the box.
     """
+    # Points this near to a face lie on it, up to rounding.
     margin = 1e-9 * (walls[1] - walls[0])
     is_on_face = (np.abs(points - walls[0]) <= margin) | (np.abs(points - walls[1]) <= margin)
     return np.where(is_on_face, 0.0, 1.0)

@@ -101,6 +101,7 @@ def _integers(points: FloatArray) -> Any:
     given points, all times the same power of two, without rounding. A double is an integer of 53
     bits times a power of two; the smallest of these powers becomes 1."""
     mantissa, exponent = np.frexp(points)
+    # As integers of 53 bits: `frexp` gives mantissas below 1.
     mantissas = np.ldexp(mantissa, 53).astype(np.int64).astype(object)
     used = mantissa != 0
     min_exponent = int(exponent[used].min()) if used.any() else 0

@@ -376,11 +376,13 @@ def _proved_regular(
     # `pieces` are the parts that are undecided, and `owner` the simplices that they belong to.
     owner, first_corners = np.arange(len(corners)), corners[:, 0]
     pieces, proved = corners, np.ones(len(corners), np.bool_)
+    # (A little less than half, for rounding.)
     half_period = np.inf if function.period is None else 0.499 * function.period
     for halving in range(_HALVINGS + 1):
         if not len(pieces):
             break
         center, radius = _balls(pieces)
+        # (1e-9 covers the rounding of the radius.)
         radius = radius * (1 + 1e-9)
         samples, change = function.gradient_bounds(center, radius)
         change = np.minimum(change, _NO_BOUND)
@@ -484,6 +486,7 @@ def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     """Distances (n,) of points (n, 3) from the curve `boundary`, measured to nine points of each of
     its edges. They are too large by at most a sixteenth of the longest edge."""
     a, b = (boundary.points[boundary.edges[:, k]] for k in (0, 1))
+    # Nine points, an eighth of the edge apart.
     fraction = np.linspace(0, 1, 9)[:, None, None]
     curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
     distances: FloatArray = kd_tree(curve_points).query(points)[0]

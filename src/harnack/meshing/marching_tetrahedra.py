@@ -175,6 +175,7 @@ def count_crossings(
     change -= period * np.round(change / period)
     length = row_norms(points.points[a] - points.points[b])
     radius = points.samples.quarter_period_radius
+    # (1e-9 covers the rounding of the length.)
     unproved_rows = np.flatnonzero(has_free_ends & (radius[a] + radius[b] < length * (1 + 1e-9)))
     if len(unproved_rows):
         p, q = points.points[a[unproved_rows]], points.points[b[unproved_rows]]
@@ -340,6 +341,7 @@ def _halves(vertices: FloatArray, ring: list[IntArray]) -> tuple[IntArray, IntAr
 
     ring: the indices (k,) of the four corners, in their order around the quadrilateral."""
     a, b, c, d = ring
+    # The lengths of the two diagonals.
     ac, bd = (row_norms(vertices[x] - vertices[y]) for x, y in ((a, c), (b, d)))
     longer = (ac > bd)[:, None]
     first = np.where(longer, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))

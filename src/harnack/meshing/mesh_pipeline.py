@@ -382,8 +382,9 @@ def _mesh_from_signs(
         """The mesh of the level set of f at `value`. side: 1; or -1 to reverse all faces. closed:
         whether parts of the box's faces close the mesh; otherwise it ends at the box.
 
-        As side effects, the mesh's entries for the metadata are appended to `facts`, the parts of
-        the level set that it lacks to `losses`, and `is_intersection_free` is set."""
+        As side effects, variables of the enclosing function change. The mesh's entries for the
+        metadata are appended to `facts`, the parts of the level set that it lacks to `losses`, and
+        `is_intersection_free` is set."""
         nonlocal is_intersection_free
         try:
             triangles, lost, more = mesh_from_signs(
@@ -699,9 +700,10 @@ def _mesh_solid(
         cells: the size of their cells; both are lengths."""
 
         def mesh_angle(angle: SolidAngle, value: float) -> TriangleMesh:
-            """The mesh of the level set of `angle` at `value`. The evaluations of `angle` are added
-            to `angle_evaluations`."""
+            """The mesh of the level set of `angle` at `value`. The number of evaluations of `angle`
+            is added to `angle_evaluations`, the count of the outermost function."""
             angle = cast("SolidAngle", _checked(angle))
+            # (None: no clip volume.)
             box = _box(angle, (value,), None)
             function = LevelFunction(angle, value, most_faces=mesh_options.most_faces)
             # In a single attempt: the caller tries again with smaller cells.

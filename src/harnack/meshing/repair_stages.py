@@ -462,6 +462,7 @@ def _remesh(
         try:
             made = _remesh_of_bounded_size(field, spacing, settings)
         except MeshingError:
+            # Once more, with cells of 0.6 times that size.
             made = _mesh_half_level(field, 0.6 * spacing, settings)
     facts = made.metadata["harnack"] | {"stage": "remeshed", "kept": 0}
     return TriangleMesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64)), facts

@@ -393,6 +393,7 @@ def _march(
             raise EmptySurfaceError("the level set is empty: no cell of the box holds the level")
         open_edges = boundary_edges(faces)
         middles = x[open_edges].mean(axis=1)
+        # Middles this near to a face of the box lie on it, up to rounding.
         margin = 1e-9 * lattice.size
         is_inside = (middles > lattice.lower + margin) & (middles < lattice.upper - margin)
         open_middles = middles[is_inside.all(axis=1)]

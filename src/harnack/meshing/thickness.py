@@ -224,6 +224,8 @@ def _medial_diameters(solid: MeshSolid, start: FloatArray, normal: FloatArray) -
     for _ in range(_MOST_ROUNDS):
         if not len(active_rows):
             break
+        # p is the point where a ball touches the surface, n the normal there, and r the ball's
+        # radius.
         p, n, r = start[active_rows], normal[active_rows], 0.5 * diameter[active_rows]
         center = p - r[:, None] * n
         distance, nearest, direction = _nearest(solid, center)

@@ -127,6 +127,7 @@ def _faces(lines: int, segments: int, shift: int) -> IntArray:
         """The indices of the vertices of lines i at angles j."""
         return _index(i, j, lines, segments, shift)
 
+    # The four corners of each quadrilateral, in their order around it.
     a, b, c, d = at(line, step), at(line, step + 1), at(line + 1, step + 1), at(line + 1, step)
     sides = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
     steps, back_lines = np.arange(segments + 1), np.arange(shift + 1)[::-1]

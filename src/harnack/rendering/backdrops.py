@@ -102,6 +102,7 @@ def lights(mi: Any, azimuth: float) -> dict[str, Any]:
     return {
         "key": {
             "type": "disk",
+            # The radius of the disk.
             "to_world": key_to_world.scale(2.2),
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(_KEY)}},
         },

@@ -163,6 +163,7 @@ class Isolines:
         if self.levels is not None or period is None:
             return self.interval
         line_count = _DEFAULT_LINE_COUNT if self.interval is None else round(period / self.interval)
+        # A user's interval may be rounded, such as 0.3333.
         if self.interval is not None and abs(line_count * self.interval - period) > 1e-4 * period:
             raise ValueError(
                 f"the function has the period {period:.6g}, and an interval of {self.interval:g} "

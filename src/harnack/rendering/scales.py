@@ -227,6 +227,7 @@ class ColorScale:
         cyclic scale is never exceeded, nor is any scale by rounding alone."""
         if self.period is not None or not numbers.size:
             return self
+        # By less than this, numbers exceed the ends by rounding alone.
         slack = 1e-6 * max(abs(self.low), abs(self.high))
         below, above = numbers.min() < self.low - slack, numbers.max() > self.high + slack
         return replace(self, exceeded=(bool(below), bool(above)))

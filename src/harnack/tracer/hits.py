@@ -498,11 +498,13 @@ def _compare_hits(
         return (
             f"hits lie up to {offset.max():.2g} off the surface, and {allowed.max():.2g} is asked"
         )
+    # Nine in ten hits must be nearer to each other than that.
     if (
         hit_both.any()
         and np.quantile((offset - rounding)[hit_both] / allowed[hit_both], 0.9) > _MAX_OFFSET
     ):
         return "hits lie elsewhere, if within the tolerance"
+    # So must the normals of nine in ten of the hits at which rays are not grazing.
     normal_changes = np.linalg.norm(actual.normal - expected.normal, axis=1)[
         hit_both & (cosine >= _GRAZING)
     ]

@@ -300,8 +300,8 @@ class JumpTracer:
 
         def add_next(now: _CoincidentJumps) -> _CoincidentJumps:
             """Add the next crossing of a facet to the sums, if it is at the same point as the
-            crossing `first` up to rounding, that is, not beyond the parameter `limit`. Returns the
-            new sums."""
+            crossing `first` of the enclosing function, up to rounding: at most at the t called
+            `limit`. Returns the new sums."""
             # The field looks for the next crossing after the place (t, facet) of the last one. The
             # jump and the normal of that one are not used.
             crossing = self._next(

@@ -269,9 +269,9 @@ def beyond(
     shortest = 4 * epsilon * reach
 
     def sample_once(now: _SearchState) -> _SearchState:
-        """Evaluate f at the next point q, and return the state after it. The variables p, value,
-        gaps, ways (two directions, each with the slope of f along it), reach and searches are the
-        parameters of `beyond`; `shortest` is a length as short as rounding."""
+        """Evaluate f at the next point q, and return the state after it. Of the variables of the
+        enclosing function, p, value, gaps, ways (two directions, each with the slope of f along
+        it), reach and searches are its parameters; `shortest` is a length as short as rounding."""
         # Which of the points q comes next.
         is_first, is_far = now.count < 3, (now.count == 2) | (now.count == 4)
         is_search = now.count >= _TRIAL_COUNT

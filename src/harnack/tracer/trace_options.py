@@ -187,6 +187,7 @@ def trace_options(
     Raises:
         TypeError: both are given; or an option is set that the called function does not have.
     """
+    # (None: no surface, so no options of a surface.)
     _refuse_not_honored(verb, None, options, keywords, honored)
     return trace_options_among(options, keywords)
 

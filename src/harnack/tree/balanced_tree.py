@@ -405,8 +405,8 @@ def for_each_primitive(
         return active & (slot < tree.leaf_size)
 
     def step(slot: Any, *state: Any) -> LoopValues:
-        """Call `body` for the primitive in a slot. Returns the number of the next slot, and then
-        the new state."""
+        """Call the caller's function `body` for the primitive in a slot. Returns the number of the
+        next slot, and then the new state."""
         return slot + 1, *body(tree.primitive(node.leaf, slot, active), active, state)
 
     return dr.while_loop((index(0), *state), is_running, step, label="leaf")[1:]

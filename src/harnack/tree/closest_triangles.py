@@ -101,8 +101,8 @@ class BoxTree:
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """The new state: the box in the record `row` if the ray enters it between `start` and
-            `end`, after the pair `after` = (`t_after`, `n_after`), and before the best box so far,
-            which is `state`; otherwise `state`."""
+            `end`, after the pair `after` of the enclosing function (split into `t_after` and
+            `n_after`), and before the best box so far, which is `state`; otherwise `state`."""
             best, leave, number = state
             near, far = enter_and_leave(row)
             # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -144,10 +144,10 @@ class BoxTree:
         pad = 16 * backend.machine_epsilon * (1 + max_norm(o))
 
         def interval(box: Any) -> tuple[Real, Real]:
-            """The t at which the rays enter the box, enlarged by `pad`, and the t at which they
-            leave it. `inverse` is one over the rays' direction, for each coordinate. box: its six
-            numbers, lower corner first."""
+            """The t at which the rays enter the box, enlarged by the length `pad`, and the t at
+            which they leave it. box: its six numbers, lower corner first."""
             low, high = vector(*box[:3]) - pad, vector(*box[3:6]) + pad
+            # `inverse` is one over the rays' direction, for each coordinate.
             a, b = (low - o) * inverse, (high - o) * inverse
             near = fmax(fmax(fmin(a.x, b.x), fmin(a.y, b.y)), fmin(a.z, b.z))
             far = fmin(fmin(fmax(a.x, b.x), fmax(a.y, b.y)), fmax(a.z, b.z))
@@ -322,9 +322,9 @@ def next_closest_triangle(
         return is_near, for_each_primitive(node, is_near & node.is_leaf, nearer, state)
 
     def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
-        """The new state: the triangle in the record `row` if it comes after the pair `after` =
-        (`square_after`, `number_after`) and before the best triangle so far, which is `state`;
-        otherwise `state`."""
+        """The new state: the triangle in the record `row` if it comes after the pair `after` of the
+        enclosing function (split into `square_after` and `number_after`) and before the best
+        triangle so far, which is `state`; otherwise `state`."""
         best, number, offset, normal, is_inner = state
         point = ClosestPointOnTriangle.of(row, x)
         # The number -1 of an empty slot is no index; such a slot is never chosen.
@@ -365,8 +365,8 @@ def _distance_test(triangles: TriangleTree, x: Vec3, pad: Real) -> Any:
     vector = triangles.tree.backend.Array3f
 
     def may_be_within(node: VisitedNode, square: Real) -> Mask:
-        """Whether the node's box and slab, enlarged by `pad`, come within the distance
-        sqrt(square) of x."""
+        """Whether the node's box and slab, enlarged by the length `pad` of `_distance_test`, come
+        within the distance sqrt(square) of x."""
         low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
         # The vector from x to the box, up to signs.
         gap = dr.select(x < low, low - x, dr.select(x > high, x - high, 0))
@@ -516,7 +516,8 @@ def jump_sum_within(triangles: TriangleTree, x: Vec3, distance: Real, active: Ma
 
     def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """The new state: the sum so far, `state`, plus |jump| of the triangle in the record `row`,
-        if the square of its distance from x is at most `square`."""
+        if its distance from x is at most `distance`."""
+        # `square` is the square of `distance`.
         is_within = (
             active
             & (row[NUMBER_COLUMN] >= 0)

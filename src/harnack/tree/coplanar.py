@@ -209,12 +209,13 @@ def _next_in_plane(
     def lower_numbered(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
         """Return the new state: the number of the face in the record `row` if this face is sought
         and its number is lower than `state`, the lowest so far; otherwise `state`. A face is sought
-        if its number is above `after`, it is larger than the lane's face (with the corners
-        `corners` and the size `size`), lies in its plane and overlaps it."""
+        if its number is above the parameter `after` of the enclosing function, and it is larger
+        than the lane's face, lies in its plane and overlaps it."""
         # The number -1 of an empty slot is no index; such a slot is never chosen.
         number = index(fmax(row[NUMBER_COLUMN], real(0)))
         other_corners = corners_of(row, vector)
         other_size = dr.gather(real, sizes, number, active)
+        # `size`, `face` and `corners` are those of the lane's face.
         is_larger = (other_size > size) | ((other_size == size) & (number > face))
         is_chosen = active & (row[NUMBER_COLUMN] > after) & (number < state[0]) & is_larger
         is_chosen &= _in_plane(corners, other_corners) & _overlap(corners, other_corners)

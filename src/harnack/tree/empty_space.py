@@ -299,7 +299,8 @@ class EmptySpaceGrid:
 
         def body(s: Real, active: Mask) -> tuple[Real, Mask]:
             """Extend s on active lanes. Returns the new s, and the mask of lanes that stay active:
-            where the cell at p + s d is empty and s is less than `length`."""
+            where the cell at p + s d is empty and the new s is less than `length`, where the search
+            may stop."""
             further, empty = extend(s)
             return dr.select(active, further, s), active & empty & (further < length)
 

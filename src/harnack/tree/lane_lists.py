@@ -130,8 +130,8 @@ def traverse_subtrees(
 
     def body(k: Any, i: Any, end: Any, *state: Any) -> LoopValues:
         """Visit node i of the subtree of list entry k; `end` is the node after that subtree. If i
-        equals `end`, begin the subtree of entry k instead. `visit` is the caller's function.
-        Returns the next k, i and `end`, and then the new state."""
+        equals `end`, begin the subtree of entry k instead. Returns the next k, i and `end`, and
+        then the new state."""
         # At the start i and end are both 0, so that the first subtree begins.
         begins = i == end
         entry = dr.gather(index, lists.entries, lists.first + k, begins & (k < lists.count))
@@ -170,8 +170,8 @@ def for_each_entry(
     index = backend.UInt32
 
     def step(k: Any, *state: Any) -> LoopValues:
-        """Call `body` for entry k of the lists. Returns the number of the next entry, and then the
-        new state."""
+        """Call the caller's function `body` for entry k of the lists. Returns the number of the
+        next entry, and then the new state."""
         active = k < lists.count
         entry = dr.gather(index, lists.entries, lists.first + k, active)
         return k + 1, *body(entry, active, state)

@@ -226,9 +226,9 @@ def _next_foreign_crossing(
 
     def body(t: Any, n: Any, active: Any) -> tuple[Any, ...]:
         """Go to the next crossing of the ray with the tree's faces, (t, number n of the crossed
-        face), up to t_max. The lane stays active while one of the two `ends` of its edge is a
-        corner of the crossed face: such crossings are skipped. `face_columns` has the first, second
-        and third corners of all faces. Returns the new t, n and mask of active lanes."""
+        face), up to t_max. The lane stays active while one of the two ends of its edge is a corner
+        of the crossed face: such crossings are skipped. Returns the new t, n and mask of active
+        lanes."""
         # A face counts as crossed also if its border is within `_COINCIDENT` of the edge.
         t, n, _, _ = tree.next_crossing(frame, (t, n), t_max, active, _COINCIDENT)
         is_found = active & (n != NO_TRIANGLE)

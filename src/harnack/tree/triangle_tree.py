@@ -279,9 +279,9 @@ class TriangleTree:
 
         def nearer(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """The new state: the crossing with the triangle in the record `row`, if it comes after
-            the crossing `after` = (`t_after`, `n_after`), not after t_max, and before the best
-            crossing so far, which is `state`; otherwise `state`. With `reach` more than 0, a border
-            within that distance of the ray counts as crossed."""
+            the crossing `after` of the enclosing function (split into `t_after` and `n_after`), not
+            after t_max, and before the best crossing so far, which is `state`; otherwise `state`.
+            With `reach` more than 0, a border within that distance of the ray counts as crossed."""
             best, number, sign, normal = state
             t, new_sign = signed_crossing(row, frame)
             # The triangle of an empty slot, number -1, has no area: its sign is 0.
@@ -355,8 +355,7 @@ class TriangleTree:
         def add(row: list[Real], active: Mask, state: LoopValues) -> LoopValues:
             """The new state (sum, mask): the sign of the crossing with the triangle in the record
             `row` is added to the sum if the crossing is between 0 and `end`. The mask becomes False
-            if rounding, of `unit` for each coordinate, may have decided whether it is between
-            them."""
+            if rounding may have decided whether it is between them."""
             total, is_sure = state
             t, sign = signed_crossing(row, frame)
             normal = normal_of(row, self.tree.backend.Array3f)
@@ -388,14 +387,14 @@ class TriangleTree:
         """
         real = self.tree.backend.Float
         is_upward, height = way > 0, way * x.z
+        # A bound of the rounding of coordinates. `height` is z, or for rays downwards -z.
         pad = 4 * self.tree.backend.machine_epsilon * (1 + dr.max(dr.abs(x)))
         low_x, high_x, low_y, high_y = x.x - pad, x.x + pad, x.y - pad, x.y + pad
 
         def visit(node: VisitedNode, state: LoopValues) -> tuple[Mask, LoopValues]:
-            """Enter a node if its box, enlarged by `pad`, meets the vertical ray from x. `low_x` to
-            `high_y` are the coordinates of x, less or more by `pad`; `height` is z, or for rays
-            downwards -z. state: the sum so far. Returns the mask of lanes that enter the node, and
-            the state, to which the triangles of a leaf have been added."""
+            """Enter a node if its box meets the vertical ray from x, up to rounding. state: the sum
+            so far. Returns the mask of lanes that enter the node, and the state, to which the
+            triangles of a leaf have been added."""
             # For rays downwards, z and the ray are mirrored: the upper end of the box is at -z0.
             x0, y0, z0, x1, y1, z1 = node.head
             is_met = (
@@ -428,12 +427,12 @@ class TriangleTree:
         inverse = dr.rcp(direction)
         o = frame.o
         size = max_norm(o)
+        # By how much boxes are enlarged: the reach, and a bound of the rounding of coordinates.
         pad = 16 * backend.machine_epsilon * (1 + size) + reach
 
         def may_meet(node: VisitedNode, t_min: Real, t_max: Real) -> Mask:
-            """Whether the ray o + t d comes within `reach` of the node's box, up to rounding, for a
-            t between t_min and t_max. `pad` is `reach` plus a bound of the rounding; `inverse` is
-            one over d, for each coordinate."""
+            """Whether the ray o + t d comes within `reach` (of `_make_box_test`) of the node's box,
+            up to rounding, for a t between t_min and t_max."""
             low, high = vector(*node.head[:3]) - pad, vector(*node.head[3:]) + pad
             # The t at which the ray passes the box's planes; it is in the box from near to far.
             a, b = (low - o) * inverse, (high - o) * inverse

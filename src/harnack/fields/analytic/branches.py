@@ -368,6 +368,7 @@ class PowerProduct(Branches):
             constant = math.prod(
                 (d + math.copysign(radius, beta)) ** beta for d, beta in other_factors
             )
+            # (1e-6 covers the rounding of the product.)
             points.append(BranchPoint(a, alpha, constant * (1 + 1e-6), radius))
         return tuple(points)
 
@@ -488,7 +489,9 @@ class _PowerProductEvaluator(BranchEvaluator):
         branches: all branches at z, as `evaluate` returns them.
 
         Each value is exp of a sum of logarithms and angles, so its relative error is a few
-        roundings of the terms of these sums. All branches have the same absolute value.
+        roundings of the terms of these sums: four of each logarithm and of each angle, times the
+        size of its exponent, and twelve for the rest. An angle is at most pi. All branches have the
+        same absolute value.
         """
         roundings = 12 + 4 * math.pi * sum(abs(alpha) for alpha in self.exponents)
         for a, alpha in zip(self.centers, self.exponents, strict=True):

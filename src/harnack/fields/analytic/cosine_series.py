@@ -393,6 +393,7 @@ class CosineSums:
             )
 
         real = self.backend.Float
+        # (gx, gy, gz) is the gradient by the angles.
         total, gx, gy, gz = self.rows.for_each(add, tuple(real(0) for _ in range(4)), "cosines")
         return total, self.rate * self.backend.Array3f(gx, gy, gz)
 
@@ -521,6 +522,7 @@ def _sum_plane(
     """
     (cos_y, slope_y), (cos_z, slope_z) = y, z
     count = len(cos_z)
+    # S, S_v, S_w and, with `second`, S_vv, S_vw, S_ww.
     sums: list[Any] = [0 * cos_y[0]] * (6 if second else 3)
     for j in reversed(range(len(cos_y))):
         # The sum over k of a_ijk cos(k w), and its derivatives by w.

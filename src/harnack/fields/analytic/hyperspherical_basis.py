@@ -138,6 +138,8 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
     l = degrees[0]  # noqa: E741
     if l > LARGEST_DEGREE:
         raise ValueError(f"the degree must be 0 to {LARGEST_DEGREE}, not {l}")
+    # Products of two polynomials up to degree 6 are integrated exactly by eight nodes of each of
+    # Gauss's rules (up to degree 15), and by 16 longitudes.
     polar_angles = math.pi * np.arange(1, 9) / 9
     z_nodes, z_weights = np.polynomial.legendre.leggauss(8)
     # The nodes of S^3: angle from the w axis, cosine of the angle from the z axis, longitude.
@@ -146,6 +148,8 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
         entry.ravel() for entry in np.meshgrid(polar_angles, z_nodes, longitudes, indexing="ij")
     )
     sine = np.sqrt(1 - cosine**2)
+    # The weights are pi/(8 + 1) sin^2 for the angle from the w axis, those of Gauss and Legendre,
+    # and 2 pi/16 for the longitude.
     quadrature_weights = (
         (np.sin(polar_angles) ** 2 * math.pi / 9)[:, None, None]
         * z_weights[:, None]
@@ -171,12 +175,14 @@ def from_monomials(coefficients: Monomials) -> tuple[int, dict[tuple[int, int], 
             weights[j, m] = float(quadrature_weights @ (values * basis))
             residual -= weights[j, m] * basis
     largest_value = float(np.abs(values).max())
+    # More than rounding is left.
     if float(np.abs(residual).max()) > 1e-9 * largest_value:
         raise ValueError(
             "the polynomial is not harmonic in R^4: its second derivatives in x, y, z and w do not "
             f"add up to zero (on the unit sphere {float(np.abs(residual).max()):.3g} is left of it)"
         )
     largest = max(abs(entry) for entry in weights.values())
+    # Weights that are rounding errors are left out.
     return l, {key: entry for key, entry in weights.items() if abs(entry) > 1e-13 * largest}
 
 

@@ -204,6 +204,7 @@ class Lobes(Field):
         sign, r > a + c^(1/3). Levels c <= 0 are within a.
         """
         beyond = max(*levels, 0.0) ** (1 / 4 if self.part == "both" else 1 / 3)
+        # (1e-6 covers the rounding of the radius.)
         return Ball(radius=(self.extent_radius() + self.scale * beyond) * (1 + 1e-6))
 
     def describe(self) -> dict[str, Any]:

@@ -404,6 +404,7 @@ class _LevelCurvesEvaluator(Evaluator):
         value = branch.value.imag if self.part == "imag" else branch.value.real
         for fraction in _DISK_FRACTIONS:
             radius = fraction * dr.minimum(clearance, _MAX_CLEARANCE)
+            # (1e-4 and 1e-5 cover the rounding of the bounds.)
             second_bound = self.branches.second_derivative_bound(Disk(z, radius, rounding)) * (
                 1 + 1e-4
             )

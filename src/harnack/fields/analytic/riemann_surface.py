@@ -230,6 +230,7 @@ class RiemannSurface(Field):
         max_height = self._max_height()
         if not max_height < math.inf:
             return self.domain
+        # (1e-5 covers the rounding of the height.)
         max_level_height = max_height * (1 + 1e-5) + max(abs(level) for level in levels)
         lower, upper = self.domain.bounds()
         if max_level_height >= min(-lower[2], upper[2]):
@@ -323,6 +324,7 @@ class _RiemannSurfaceEvaluator(Evaluator):
             free_radius = fmin(dr.select(is_touching, radius, change_radius), free_radius)
             touching_count += dr.select(is_touching, 1, 0)
         remainder = TaylorRemainder(second_bound, free_radius)
+        # By Taylor's formula; the factors 1 + 1e-5 cover rounding.
         max_slope = (steepest + second_bound * radius) * (1 + 1e-5)
         max_change = (max_slope * free_radius + 0.5 * second_bound * free_radius * free_radius) * (
             1 + 1e-5

@@ -180,6 +180,7 @@ def sum_along(
         weight; and the number of these blobs.
         """
         start, sums = state[:_VALUE_STATE_SIZE], list(state[_VALUE_STATE_SIZE:])
+        # Of a record, entry 6 is one over the radius of the support, and entry 7 the amplitude.
         inverse_radius, amplitude = row[6], row[7]
         offset = _vector_to_center(p, row) * inverse_radius
         start = _add_value(kernel, offset, inverse_radius, amplitude, start)
@@ -283,6 +284,7 @@ def hessian_at(kernel: BlobKernel, backend: Backend, p: Vec3, for_each: ForEach)
         With v the vector from p to the center in units of the support's radius R, and q = |v|^2,
         the Hessian of A k(q) is (A/R^2) (2 k' I + 4 k'' v v^T).
         """
+        # Of a record, entry 6 is one over the radius of the support, and entry 7 the amplitude.
         inverse_radius, amplitude = row[6], row[7]
         offset = _vector_to_center(p, row) * inverse_radius
         q = dr.dot(offset, offset)
@@ -370,6 +372,7 @@ def _finished_value(kernel: BlobKernel, backend: Backend, state: State) -> SumVa
         term_count,
     ) = state
     roundoff = 0.5 * backend.machine_epsilon
+    # The module's docstring has the numbers: 8 u |dk/dq| and (16 + n) u m, each summed.
     error = roundoff * dr.fma(16 + term_count, rounding_sum, 8 * slope_sum)
     gradient_error = roundoff * (32 + term_count) * kernel.steepness.slope * gradient_size
     return SumValue(
@@ -526,6 +529,7 @@ def blob_term(kernel: BlobKernel, coordinates: Coordinates) -> Term:
     def term(row: list[Real]) -> Jet:
         """The jet of a blob: amplitude times k(q), with q the squared distance from the center in
         units of the support's radius. row: the blob's record."""
+        # Of a record, entry 6 is one over the radius of the support, and entry 7 the amplitude.
         inverse_radius, amplitude = row[6], row[7]
         x, y, z = (
             ((axis - row[k]) - row[3 + k]) * inverse_radius for k, axis in enumerate(coordinates)

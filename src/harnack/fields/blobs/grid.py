@@ -76,6 +76,7 @@ class CellLists(GridData):
             )
             if not too_large or counts.max() == 1:
                 break
+            # Too many cells or entries: again with larger cells.
             size *= 1.25
         shape = (int(counts[0]), int(counts[1]), int(counts[2]))
         cell_of_pair, blob_of_pair = _cell_ball_pairs(centers, supports, origin, size, shape)
@@ -108,6 +109,7 @@ def _cell_ball_pairs(
     Returns the index of the cell and the index of the ball of each pair, sorted by balls. The index
     of the cell (i, j, k) is i + nx (j + ny k).
     """
+    # (1e-6 covers the rounding of the positions.)
     padded_radii = radii * (1 + 1e-6)
     first_cell = np.floor((centers - padded_radii[:, None] - origin) / size - _MARGIN).astype(
         np.int64

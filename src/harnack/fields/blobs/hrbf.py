@@ -105,6 +105,7 @@ class HRBF(Formula):
         max_offsets = np.abs(corners[:, None] - self.points).max(axis=0)
         r = np.linalg.norm(max_offsets, axis=1)
         vector_norms = np.linalg.norm(self.gradient_coefficients, axis=1)
+        # (1e-6 covers the rounding of the sum.)
         return float((3 * np.abs(self.value_coefficients) * r * r + 6 * vector_norms * r).sum()) * (
             1 + 1e-6
         )
@@ -179,6 +180,7 @@ class _DeviceFunction:
             p_i in two parts (entries 0 to 5), a (6), and 3 b (7 to 9)."""
             u, v, w = ((entry - row[k]) - row[3 + k] for k, entry in enumerate((x, y, z)))
             r = (u**2 + v**2 + w**2).apply(sqrt)
+            # a r^3 + r (3 b . v)
             return r**3 * row[6] + r * (u * row[7] + v * row[8] + w * row[9])
 
         return sum_jets(term, x, self.backend.Float(0), for_each_record(self.records))

@@ -67,6 +67,7 @@ class BoundaryRates:
             by a tree over caps.
         """
         if not len(mesh.singular_edges):
+            # (None: nothing is summed.)
             return cls(None)
         if whole.cells is not None:
             return cls(whole)

@@ -659,6 +659,7 @@ class BlendedSolid(FormulaSolid):
         """
         if level >= self.radius:
             return level
+        # (1 - 1e-9 moves the bound upwards, by more than its rounding.)
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:

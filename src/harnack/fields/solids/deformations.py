@@ -317,6 +317,7 @@ class Taper(Deformation):
         m = (axis_distance + radius) * dr.abs(last - first) / (b - a) * k * k
         total = k * k + m * m + 1
         root = dr.sqrt(fmax(total * total - 4 * k * k, 0))
+        # (1e-5 covers the rounding of the constant.)
         return dr.sqrt(0.5 * (total + root)) * (1 + 1e-5), radius
 
     def on_backend(self, backend: Backend) -> Taper:

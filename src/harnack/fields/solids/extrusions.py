@@ -460,6 +460,7 @@ class ExtrusionEnclosure(Enclosure):
         )
         up = fmax(gaps.above, dr.select(is_inside, up, 0))
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
+        # (1e-6 covers the rounding of the length.)
         return dr.select(is_valid, fmin(down, up) * (1 - 1e-6), 0)
 
     def _fall(self, gap: Real) -> Real:
@@ -516,6 +517,7 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
         jet_u, jet_v: the jets of the two coordinates.
         """
         a, b = zero + jet_u.first_derivatives[i].max_abs, zero + jet_v.first_derivatives[i].max_abs
+        # (1e-5 covers the rounding of the length.)
         limit = dr.sqrt(dr.fma(a, a, b * b)) * (1 + 1e-5)
         return Interval(-limit, limit)
 

@@ -91,7 +91,9 @@ def fade(kind: Fade, t: Any) -> tuple[Any, Any, Any]:
     kind: which fade function: "quintic" or "cubic".
     """
     if kind == "cubic":
+        # 3 t^2 - 2 t^3
         return t * t * (3 - 2 * t), 6 * t * (1 - t), 6 - 12 * t
+    # 6 t^5 - 15 t^4 + 10 t^3 (Perlin 2002)
     rest = 1 - t
     return (
         t * t * t * (10 + t * (6 * t - 15)),
@@ -376,6 +378,7 @@ class _NoiseFormula:
             # and there is no bound.
             size = fmax(fmax(dr.abs(center[0]), dr.abs(center[1])), dr.abs(center[2])) * scale
             position_error = dr.select(size < 2.0**30, epsilon * size, dr.inf)
+            # (1e-5 covers the rounding of the products.)
             octave = _Octave(
                 center=center,
                 value=value,
@@ -548,6 +551,7 @@ class _Octave:
             fmax(dr.abs(coordinate.value.upper - q), dr.abs(coordinate.value.lower - q))
             for coordinate, q in zip(coordinates, self.center, strict=True)
         ]
+        # (1e-5 covers the rounding of the distance.)
         distance = _norm3(offsets) * (1 + 1e-5)
         error = error + self.slope * distance
         piece_value = Interval(self.value - error, self.value + error)

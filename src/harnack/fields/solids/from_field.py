@@ -305,6 +305,7 @@ def field_jet(evaluator: Evaluator, x: Jet, y: Jet, z: Jet, name: str) -> Jet:
             rate = _interval_sum(
                 g * entry.second_derivatives[k] for g, entry in zip(slopes, jets, strict=True)
             )
+            # (1e-5 covers the rounding of the products.)
             if rows is None:
                 margin = limit * speeds[i] * speeds[j] * (1 + 1e-5)
             else:

@@ -122,6 +122,7 @@ class Julia(Solid):
         fourth_coordinate^2.
         """
         b, scaled = self.escape_radius, 2.0**self.iterations * level
+        # In double precision exp overflows at about 709.
         if above or scaled > 600.0:
             return None
         # The largest possible t; then the largest |q_0|.

@@ -492,6 +492,7 @@ def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
         jets: the jets of the three coordinates, which are functions of one or more variables.
         """
         return [
+            # (1e-5 covers the rounding of the length.)
             dr.sqrt(sum(dr.square(zero + coord.first_derivatives[i].max_abs) for coord in jets))
             * (1 + 1e-5)
             for i in range(len(x.first_derivatives))

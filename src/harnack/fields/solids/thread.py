@@ -341,6 +341,7 @@ class OutsideCylinderEnclosure(Enclosure):
         )
         is_known &= (length >= 0) & dr.isfinite(excess + squared + product)
         length = dr.select(gaps.below == dr.inf, dr.inf, dr.select(is_known, length, 0))
+        # (1e-5 covers the rounding of the length.)
         return fmax(fmin(length, gaps.above / self.constant), 0) * (1 - 1e-5)
 
 

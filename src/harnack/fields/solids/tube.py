@@ -390,6 +390,7 @@ def _group_segments(records: FloatArray) -> tuple[FloatArray, FloatArray]:
     points = ends.reshape(-1, 2 * _GROUP_SIZE, 3)
     centers = 0.5 * (points.min(axis=1) + points.max(axis=1))
     radii = np.linalg.norm(points - centers[:, None], axis=2).max(axis=1)
+    # (1e-5 covers rounding.)
     return records, np.column_stack([centers, radii * (1 + 1e-5)])
 
 
@@ -563,6 +564,7 @@ class TangentEnclosure(Enclosure):
             is_free &= is_clear
             start, bound = knot, next_bound
         is_valid = (length_down >= 0) & (length_up >= 0)
+        # (1e-6 covers the rounding of the length.)
         return dr.select(is_valid, fmin(length_down, length_up) * (1 - 1e-6), 0)
 
 
