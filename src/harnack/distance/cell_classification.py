@@ -94,7 +94,7 @@ class ClipCurveDescent:
         x = vector(x)
 
         def body(
-            y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, ddy: Vec3, normal: Vec3,
+            y: Vec3, best: Vec3, nearest: Real, w: Real, tangent: Vec3, second: Vec3, normal: Vec3,
             face_normal: Vec3, face_offset: Real, corner: Any, factor: Real, tries: Any, k: Any,
             active: Mask,
         ) -> tuple[Any, ...]:  # fmt: skip
@@ -103,8 +103,8 @@ class ClipCurveDescent:
 
             best, nearest: the best point of the curve so far, and its distance from x; infinite if
                 there is none.
-            w, tangent, ddy, normal: Newton's step, the curve's derivatives and the face's normal at
-                `best`.
+            w, tangent, second, normal: Newton's step, the curve's tangent and second
+                derivative y'', and the face's normal, all at `best`.
             face_normal, face_offset: the plane of another face that ends steps; the normal is 0 if
                 there is none.
             corner: 0 before the search has come to a corner; `_TURNING` if its next step leads into
@@ -142,7 +142,7 @@ class ClipCurveDescent:
             w = dr.select(accepted, clamp(step, -distance, distance), w)
             best, nearest = dr.select(accepted, y, best), dr.select(accepted, distance, nearest)
             tangent = dr.select(accepted, trial.tangent, tangent)
-            ddy = dr.select(accepted, trial.second_derivative, ddy)
+            second = dr.select(accepted, trial.second_derivative, second)
             changes_face = accepted & is_new_face
             face_normal = dr.select(
                 crosses_face, trial.normal, dr.select(changes_face, 0, face_normal)
@@ -153,18 +153,18 @@ class ClipCurveDescent:
             normal = dr.select(accepted, trial.normal, normal)
             factor = dr.select(accepted, fmin(4 * factor, 1), factor)
             factor = dr.select(is_rejected & ~crosses_face, 0.25 * factor, factor)
-            # The step s meets the face where face_rate |s| + s^2/2 face_normal.ddy = face_gap.
+            # The step s meets the face where face_rate |s| + s^2/2 face_normal.y'' = face_gap.
             s, face_gap = factor * w, fmax(face_offset - dr.dot(face_normal, best), 0)
             face_rate = dr.sign(w) * dr.dot(face_normal, tangent)
             limit_divisor = face_rate + dr.sqrt(
-                face_rate * face_rate + 2 * face_gap * dr.dot(face_normal, ddy)
+                face_rate * face_rate + 2 * face_gap * dr.dot(face_normal, second)
             )
             limit = dr.select(
                 limit_divisor > 0, _STEP_TO_FACE * 2 * face_gap / limit_divisor, dr.inf
             )
             is_limited = ~(has_no_face & ~crosses_face) & (limit < dr.abs(s))
             s = dr.select(is_limited, clamp(s, -limit, limit), s)
-            target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * ddy
+            target = dr.fma(vector(s), tangent, best) + vector(0.5 * s * s) * second
             # The search ends at short steps, unless a face has shortened them.
             min_step = dr.select(is_limited, 0, _MIN_RELATIVE_STEP * nearest)
             is_short = dr.abs(s) <= fmax(min_step, trial.near)
@@ -186,7 +186,7 @@ class ClipCurveDescent:
                 dr.select(is_corrected, tries + 1, 0),
             )
             return (
-                y, best, nearest, w, tangent, ddy, normal, face_normal, face_offset, corner, factor,
+                y, best, nearest, w, tangent, second, normal, face_normal, face_offset, corner, factor,
                 tries, k + 1, active,
             )  # fmt: skip
 
@@ -200,7 +200,7 @@ class ClipCurveDescent:
             count(0), real(1), count(0), count(0), self.backend.Bool(True),
         )  # fmt: skip
         final = dr.while_loop(state, is_active, body, label="along the rim")
-        # The best point, and its curvature, which is the length of y'' (`ddy`).
+        # The best point, and its curvature, which is the length of y'' (`second`).
         return final[1], safe_norm(final[5])
 
     def _at(self, y: Vec3) -> _ClipCurveState:

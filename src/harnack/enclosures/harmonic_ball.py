@@ -257,8 +257,8 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             if u is None:
                 continue
             # u = 0 forces u to vanish identically: no level is ever reached.
-            inv_u = dr.select(u > 0, 1 / u, dr.inf)
-            scale = self.radius * inv_u / self.dimension
+            inverse_u = dr.select(u > 0, 1 / u, dr.inf)
+            scale = self.radius * inverse_u / self.dimension
             # m = R f_v/(n u), the mean of the cosine s over the mass on the sphere whose Poisson
             # integral is u, at the largest and at the smallest slope f_v.
             mean_upper = dr.select(u > 0, slopes.upper * scale, 0)
@@ -268,10 +268,12 @@ class HarnackSlopeEnclosure(HarmonicBallEnclosure):
             # as at most u, since u stays positive.)
             m_max, m_min = fmax(fmin(mean_upper + slack, 1), -1), clamp(mean_lower - slack, -1, 1)
             conditions_away.append(
-                _ChordCondition.of(fmin(gap_away * inv_u, _UNREACHABLE_GAP), m_max, self.dimension)
+                _ChordCondition.of(
+                    fmin(gap_away * inverse_u, _UNREACHABLE_GAP), m_max, self.dimension
+                )
             )
             conditions_toward.append(
-                _JensenCondition(fmin(gap_toward * inv_u, 1), m_min, self.dimension)
+                _JensenCondition(fmin(gap_toward * inverse_u, 1), m_min, self.dimension)
             )
         return up, down
 

@@ -330,13 +330,13 @@ def _columns(
     """
     columns: dict[str, PropertyColumn] = {}
     positions, offset = begins, 0
-    for prop in section.properties:
-        if prop.length_code is None:  # a single number, with no lengths of lists
-            columns[prop.name] = PropertyColumn(prop.code, positions, offset, None)
-            offset += values.width(prop.code)
+    for ply_property in section.properties:
+        if ply_property.length_code is None:  # a single number, with no lengths of lists
+            columns[ply_property.name] = PropertyColumn(ply_property.code, positions, offset, None)
+            offset += values.width(ply_property.code)
             continue
         # What follows a list begins at another place in each row: positions are counted from there.
-        lengths = values.read(positions + offset, prop.length_code)
+        lengths = values.read(positions + offset, ply_property.length_code)
         # Lengths are read as floats only if one of them is not whole.
         if lengths.dtype.kind == "f":
             k = int(np.argmax(lengths != np.rint(lengths)))
@@ -345,9 +345,9 @@ def _columns(
         # file.
         sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
         sizes = np.minimum(sizes, values.size + 1)
-        offset += values.width(prop.length_code)
-        columns[prop.name] = PropertyColumn(prop.code, positions, offset, sizes)
-        positions, offset = positions + offset + values.width(prop.code) * sizes, 0
+        offset += values.width(ply_property.length_code)
+        columns[ply_property.name] = PropertyColumn(ply_property.code, positions, offset, sizes)
+        positions, offset = positions + offset + values.width(ply_property.code) * sizes, 0
     return columns, positions + offset
 
 
@@ -438,12 +438,12 @@ def _row_ends(section: PlyElement, values: BinaryValues, begin: int) -> Iterator
     # each of its numbers. At the end `fixed_bytes` is what follows the last list.
     fixed_bytes = 0
     lists: list[tuple[int, struct.Struct, int]] = []
-    for prop in section.properties:
-        if prop.length_code is None:
-            fixed_bytes += values.width(prop.code)
+    for ply_property in section.properties:
+        if ply_property.length_code is None:
+            fixed_bytes += values.width(ply_property.code)
         else:
-            length = struct.Struct(values.byte_order + prop.length_code)
-            lists.append((fixed_bytes, length, values.width(prop.code)))
+            length = struct.Struct(values.byte_order + ply_property.length_code)
+            lists.append((fixed_bytes, length, values.width(ply_property.code)))
             fixed_bytes = 0
     position = begin
     for _ in range(section.count):

@@ -194,14 +194,14 @@ class Polytope(Volume):
         bounds of the rounding errors of h - n.o and of n.d, for rays o + t d. table: the planes of
         the polytope."""
         del table
-        eps = clip_rounding(backend_of(o))
+        rounding = clip_rounding(backend_of(o))
         abs_o, abs_d = dr.abs(o), dr.abs(d)
 
         def slacks(n: Vec3, h: Real) -> RoundingSlacks:
             """Bounds of the rounding errors of h - n.o and of n.d, as a pair, for the plane n.x <=
             h."""
             abs_n = dr.abs(n)
-            return eps * (dr.dot(abs_n, abs_o) + dr.abs(h)), eps * dr.dot(abs_n, abs_d)
+            return rounding * (dr.dot(abs_n, abs_o) + dr.abs(h)), rounding * dr.dot(abs_n, abs_d)
 
         return slacks
 
@@ -245,13 +245,13 @@ class Polytope(Volume):
     def contains(self, p: Vec3) -> Mask:
         """Whether points p lie in the polytope, up to rounding."""
         backend = backend_of(p)
-        eps = clip_rounding(backend)
+        rounding = clip_rounding(backend)
         abs_p = dr.abs(p)
 
         def step(state: tuple[Mask], n: Vec3, h: Real) -> tuple[Mask]:
             """Whether the points lie in the half-space n.x <= h, too, up to rounding. state:
             whether they lie in all half-spaces before; a tuple of one, as is the result."""
-            slack = eps * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
+            slack = rounding * (dr.dot(dr.abs(n), abs_p) + dr.abs(h))
             return (state[0] & (dr.dot(n, p) - h <= slack),)
 
         all_lanes = dr.full(backend.Bool, True, dr.width(p))

@@ -156,6 +156,7 @@ def _widest_gap_direction(a: FloatArray, b: FloatArray) -> FloatArray:
     distance = np.hypot(a, b)
     angle = np.arctan2(b, a)
     farthest = np.take_along_axis(angle, distance.argmax(axis=1)[:, None], axis=1)
+    # Points nearer than 1e-10 count as at the origin.
     angle = np.sort(np.where(distance > 1e-10, angle, farthest), axis=1)
     # Gaps between successive angles; the last one goes around to the first angle.
     gap = np.diff(angle, axis=1, append=angle[:, :1] + 2.0 * np.pi)

@@ -361,14 +361,16 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
             "level": field.default_level,
             "is_convex": field.is_convex,
         }
-        params = inspect.signature(expression).parameters
-        data |= {k: _to_json_value(v) for k, v in keywords.items() if v != params[k].default}
+        parameters = inspect.signature(expression).parameters
+        data |= {k: _to_json_value(v) for k, v in keywords.items() if v != parameters[k].default}
         # A formula without parameters has no such entry.
         return {name: value for name, value in data.items() if value != {}}
     if type(field) is SolidAngle and not field.circles:
         values = {"lift_bound": field.lift_bound_option, "cells": field.cells}
-        params = inspect.signature(SolidAngle).parameters
-        options = {name: value for name, value in values.items() if value != params[name].default}
+        parameters = inspect.signature(SolidAngle).parameters
+        options = {
+            name: value for name, value in values.items() if value != parameters[name].default
+        }
         _check_cells(options)
         return {"curves": [np.asarray(loop).tolist() for loop in field.loops], **options}
     if type(field).__name__ not in _constructible_types():

@@ -336,9 +336,9 @@ def _edge_may_pierce(
     return pierces
 
 
-def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corners:
-    """The corners of the triangle `tri` in the same cyclic order, begun so that the shared corners
-    come first.
+def _shared_corners_first(triangle: Corners, shared: list[Mask], count: Real) -> Corners:
+    """The corners of a triangle in the same cyclic order, begun so that the shared corners come
+    first.
 
     shared: whether each corner is shared.
     count: how many are shared. With none or three the order has no meaning.
@@ -351,7 +351,11 @@ def _shared_corners_first(tri: Corners, shared: list[Mask], count: Real) -> Corn
     has_none = count < 0.5
     from_second, from_third = from_second & ~has_none, from_third & ~has_none
     return tuple(
-        dr.select(from_second, tri[(k + 1) % 3], dr.select(from_third, tri[(k + 2) % 3], tri[k]))
+        dr.select(
+            from_second,
+            triangle[(k + 1) % 3],
+            dr.select(from_third, triangle[(k + 2) % 3], triangle[k]),
+        )
         for k in range(3)
     )  # type: ignore[return-value]
 

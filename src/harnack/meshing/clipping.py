@@ -164,11 +164,17 @@ def _cut(surface: TriangleMesh, boundary: _ClipBoundary) -> TriangleMesh:
     for k in range(3):
         order = [k, (k + 1) % 3, (k + 2) % 3]
         # Faces with one corner outside, begun at that corner.
-        tri = rows[(outer_count == 1) & is_out[is_mixed][:, k]][:, order]
+        triangles = rows[(outer_count == 1) & is_out[is_mixed][:, k]][:, order]
         # Two corners inside: the part is a quadrilateral, two triangles. p and q are the points at
         # which the edges at the outer corner are cut.
-        p, q = (crossing(tri[:, 1], tri[:, 0]), crossing(tri[:, 2], tri[:, 0]))
-        pieces += [np.stack([tri[:, 1], tri[:, 2], p], axis=1), np.stack([tri[:, 2], q, p], axis=1)]
+        p, q = (
+            crossing(triangles[:, 1], triangles[:, 0]),
+            crossing(triangles[:, 2], triangles[:, 0]),
+        )
+        pieces += [
+            np.stack([triangles[:, 1], triangles[:, 2], p], axis=1),
+            np.stack([triangles[:, 2], q, p], axis=1),
+        ]
         # Faces with two corners outside, begun at the corner inside: a triangle at it remains.
         tip = rows[(outer_count == 2) & ~is_out[is_mixed][:, k]][:, order]
         pieces.append(

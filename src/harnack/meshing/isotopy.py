@@ -302,8 +302,8 @@ def _proved_by_stars(
     vertex_number[vertices] = np.arange(len(vertices))
     # Pairs of a tetrahedron and the column, 0 to 3, of a corner of it among `vertices`; then pairs
     # ("entries") of a gradient and such a column of its tetrahedron.
-    tet, column = np.nonzero(vertex_number[index] >= 0)
-    vertex_of_pair = vertex_number[index[tet, column]]
+    tetrahedron, column = np.nonzero(vertex_number[index] >= 0)
+    vertex_of_pair = vertex_number[index[tetrahedron, column]]
     entry, column_of_entry = np.nonzero(vertex_number[index[slopes.owner]] >= 0)
     vertex_of_entry = vertex_number[index[slopes.owner[entry], column_of_entry]]
     units = slopes.slope[entry]
@@ -320,13 +320,13 @@ def _proved_by_stars(
     is_proved[vertex_of_entry[(normal[vertex_of_entry] * units).sum(axis=1) <= 1e-9]] = False
     has_slope = np.bincount(slopes.owner, minlength=len(index)) > 0
     # A tetrahedron without a gradient proves nothing at its corners.
-    is_proved[vertex_of_pair[~has_slope[tet]]] = False
+    is_proved[vertex_of_pair[~has_slope[tetrahedron]]] = False
     # n . grad f > 0 on each tetrahedron around the corners that are left; n takes the place of grad
     # F. Then no value of F is needed (zeros), and points may move along all axes (ones).
     tried = np.flatnonzero(is_proved[vertex_of_pair])
     no_values = np.zeros(len(tried))
     is_regular = _proved_regular(
-        function, corners[tet[tried]], no_values, normal[vertex_of_pair[tried]], np.ones(3)
+        function, corners[tetrahedron[tried]], no_values, normal[vertex_of_pair[tried]], np.ones(3)
     )
     is_proved[vertex_of_pair[tried[~is_regular]]] = False
     return np.asarray(is_proved[vertex_number[index[rows]]].all(axis=1), np.bool_)

@@ -558,12 +558,12 @@ class _CreaseRefinement:
         ends = all_edges.vertices[rows]
         one, other = normals[ends[:, 0]], normals[ends[:, 1]]
         a, b = x[ends[:, 0]], x[ends[:, 1]]
-        fraction, to_line, sine2 = _toward_tangent_planes(a, b, one, other)
+        fraction, to_line, squared_sine = _toward_tangent_planes(a, b, one, other)
         edge_length = row_norms(b - a)
         # Of these, the edges that are far from the line in which the tangent planes meet; neither
         # nearly parallel planes nor short edges.
         is_far = (
-            (sine2 > _MIN_SQUARE)
+            (squared_sine > _MIN_SQUARE)
             & (row_norms(to_line) > tolerance)
             & (edge_length > _SHORTEST * tolerance)
         )
@@ -640,12 +640,12 @@ def _toward_tangent_planes(
     cross it. So the new triangles do not fold.
     """
     edge, line = b - a, np.cross(n_a, n_b)
-    cosine, sine2 = row_dots(n_a, n_b), row_dots(line, line)
+    cosine, squared_sine = row_dots(n_a, n_b), row_dots(line, line)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # A point of the line, relative to a: p.n_a = 0 and p.n_b = edge.n_b.
-        factor = row_dots(edge, n_b) / sine2
+        factor = row_dots(edge, n_b) / squared_sine
         point = factor[:, None] * (n_b - cosine[:, None] * n_a)
-        axis = line / np.sqrt(sine2)[:, None]
+        axis = line / np.sqrt(squared_sine)[:, None]
         # The part of the edge across the line decides where it is nearest to the line.
         across = edge - row_dots(edge, axis)[:, None] * axis
         fraction = row_dots(point, across) / row_dots(across, across)
@@ -654,7 +654,11 @@ def _toward_tangent_planes(
         # From the point of the edge to the nearest point of the line.
         direction = point + row_dots(foot - point, axis)[:, None] * axis - foot
     is_finite = np.isfinite(fraction) & np.isfinite(direction).all(axis=1)
-    return np.where(is_finite, fraction, 0.5), np.where(is_finite[:, None], direction, 0.0), sine2
+    return (
+        np.where(is_finite, fraction, 0.5),
+        np.where(is_finite[:, None], direction, 0.0),
+        squared_sine,
+    )
 
 
 def _level_along(
@@ -707,8 +711,8 @@ def _crease_corners(
         have such a vertex.
     """
     corner, normal = x[faces[rows]], normals[faces[rows]]
-    det: Any = np.linalg.det
-    independent = np.flatnonzero(np.abs(det(normal)) > _INDEPENDENT)
+    determinant: Any = np.linalg.det
+    independent = np.flatnonzero(np.abs(determinant(normal)) > _INDEPENDENT)
     rows, corner, normal = rows[independent], corner[independent], normal[independent]
     center = corner.mean(axis=1)
     # The common point p of the planes n_k . (p - corner_k) = 0, relative to the center.

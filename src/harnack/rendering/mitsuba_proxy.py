@@ -230,12 +230,12 @@ def _carrier_class(variant: str) -> Any:
             backend, size = mitsuba_backend(mi), float(np.linalg.norm(np.diff(ends, axis=0)))
             self.placed = PlacedSurface.of(surface, placement, backend, isolines, size)
             self.line_colors = tuple(isoline.srgb for isoline in isolines)
-            params = mi.traverse(self)
+            mesh_parameters = mi.traverse(self)
             # Two triangles, each a single point at a corner of the box in the world.
             corners = np.concatenate(placement.world_bounds(ends))
-            params["vertex_positions"] = upload_floats(backend, corners)
-            params["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
-            params.update()
+            mesh_parameters["vertex_positions"] = upload_floats(backend, corners)
+            mesh_parameters["faces"] = mi.UInt32([0, 0, 0, 1, 1, 1])
+            mesh_parameters.update()
 
         def to_string(self) -> str:
             return f"HarnackSurface[field = {self.surface.field!r}, bsdf = {self.bsdf()}]"

@@ -212,7 +212,7 @@ def _loaded(mi: Any, source: Any, size: tuple[int, int] | None) -> Any:
         raise ValueError("the scene has no sensor to look through")
     if size is not None:
         # Mitsuba changes the size of a film that is loaded already.
-        params = mi.traverse(scene.sensors()[0])
-        params["film.size"] = size
-        params.update()
+        scene_parameters = mi.traverse(scene.sensors()[0])
+        scene_parameters["film.size"] = size
+        scene_parameters.update()
     return scene

@@ -135,7 +135,7 @@ def inner_and_outer_ball(volume: Volume | None, backend: Backend) -> tuple[Vec3,
     return backend.Array3f(*parameters[:3]), parameters[3], parameters[4]
 
 
-# The number of directions across the picture, and of taps along each; the length that they cover,
+# The number of directions across the picture, and of points along each; the length that they cover,
 # as a fraction of the larger side of the picture; and the sine of an elevation below which facets
 # and rounding stay.
 SKY_DIRECTIONS = 16
@@ -167,7 +167,7 @@ def ambient_visibility(
     reach_in_pixels = SKY_REACH * max(size)
     reach_in_space = reach_in_pixels * width
 
-    def tap(k: int, direction: Any) -> Any:
+    def shading_sine(k: int, direction: Any) -> Any:
         """Look at the k-th pixel along a direction (2,) in the picture. Returns the sine of the
         elevation of its point over the tangent plane, multiplied by a factor that falls with its
         distance; 0 if nothing is seen there."""
@@ -188,14 +188,14 @@ def ambient_visibility(
     def add_direction(turn: Any, hidden: Any) -> tuple[Any, Any]:
         """Do one step of the loop over directions. Returns the index of the next direction, and the
         sum of hidden fractions with this direction added. The hidden fraction of a direction is the
-        square of the largest sine that `tap` returns for it.
+        square of the largest sine that `shading_sine` returns for it.
 
         turn: the index of this direction. hidden: the sum so far.
         """
         s, c = dr.sincos((mi.Float(turn) + 0.5) * (dr.two_pi / SKY_DIRECTIONS))
         highest = mi.Float(0)
         for k in range(SKY_SAMPLES):
-            highest = dr.maximum(highest, tap(k, mi.Vector2f(c, s)))
+            highest = dr.maximum(highest, shading_sine(k, mi.Vector2f(c, s)))
         return turn + 1, hidden + dr.square(highest)
 
     def is_running(turn: Any, hidden: Any) -> Any:

@@ -356,9 +356,11 @@ def _cut_meets_triangle(pieces: FloatArray, heights: FloatArray, knives: FloatAr
     # Where each edge of a piece meets the plane of its knife; NaN if it does not.
     ends: list[FloatArray] = []
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        hi, hj = heights[:, i], heights[:, j]
-        is_crossed = (hi * hj < 0) | ((hi == 0) ^ (hj == 0))
-        fraction = np.where(is_crossed, hi / np.where(is_crossed, hi - hj, 1), np.nan)
+        height_i, height_j = heights[:, i], heights[:, j]
+        is_crossed = (height_i * height_j < 0) | ((height_i == 0) ^ (height_j == 0))
+        fraction = np.where(
+            is_crossed, height_i / np.where(is_crossed, height_i - height_j, 1), np.nan
+        )
         ends.append(pieces[:, i] + fraction[:, None] * (pieces[:, j] - pieces[:, i]))
     low, high = np.zeros(len(pieces)), np.ones(len(pieces))
     points = np.stack(ends, axis=1)

@@ -287,7 +287,8 @@ class _LLVMParser:
             loop = self._loops.pop()
             # The values after an iteration were kept as text until all of the body was known.
             loop.variables = [
-                replace(var, after=self._value(str(var.after), var.kind)) for var in loop.variables
+                replace(variable, after=self._value(str(variable.after), variable.kind))
+                for variable in loop.variables
             ]
             outer_loop = self._loops[-1] if self._loops else None
             self._current_block = outer_loop.body if outer_loop else self.statements

@@ -370,8 +370,8 @@ def _float_class_test(classes: int, x: str) -> str:
     return " | ".join(test for mask, test in tests.items() if classes & mask)
 
 
-def _conversion(op: Operation, name: str, source: str, x: str) -> str:
-    """Return the WGSL expression that converts x to the type of the operation `op`.
+def _conversion(operation: Operation, name: str, source: str, x: str) -> str:
+    """Return the WGSL expression that converts x to the type of the operation `operation`.
 
     name: the LLVM conversion, such as "sitofp" (signed integer to float).
     source: the type of x: "f32", "u32" or "bool".
@@ -379,7 +379,7 @@ def _conversion(op: Operation, name: str, source: str, x: str) -> str:
     Raises:
         UntranslatableError: the conversion is unknown.
     """
-    match name, source, op.kind:
+    match name, source, operation.kind:
         case "bitcast", _, kind:
             return x if source == kind else f"bitcast<{kind}>({x})"
         case "sitofp", "u32", _:
@@ -400,4 +400,6 @@ def _conversion(op: Operation, name: str, source: str, x: str) -> str:
         case "zext" | "trunc", "u32", "u32":
             return x
         case _:
-            raise UntranslatableError(f"{op.name} to {op.kind} is not translated for other GPUs")
+            raise UntranslatableError(
+                f"{operation.name} to {operation.kind} is not translated for other GPUs"
+            )

@@ -461,7 +461,10 @@ class _RiemannSurfaceEvaluator(Evaluator):
             p.z
         )
         error = backend_of(p).machine_epsilon * error_units
-        for point in self.branches.points:  # slopes do not bound the rounding of values there
+        # Near a branch point, slopes do not bound the rounding of values. If z is within 2
+        # roundings of the point, the exact z is within 3, and both values are within the point's
+        # bound of their common value: the error is at most twice that bound.
+        for point in self.branches.points:
             if point.power is not None:
                 is_close = abs(z - point.at) <= 2 * rounding
                 jump = (
@@ -578,6 +581,7 @@ class _RiemannSurfaceEvaluator(Evaluator):
             if self.shift is None:
                 approach_rate = fmax(-dr.mulsign(d.z, height), 0)
             gap = fmax(dr.abs(height) - local.error, 0)
+            # (1e-6 and 1e-5 cover rounding.)
             inner_radius = 0 * height + point.radius * (1 - 1e-6) - local.rounding
             # The bound of the heights near the branch point: its power, its constant, and the
             # radius within which it holds.

@@ -254,6 +254,8 @@ def sum_along(
     state = for_each(add_blob, tuple(real(0) for _ in range(_VALUE_STATE_SIZE + 4 * count + 3)))
     steepness = kernel.steepness
     slope_size, second_size, term_count = state[-3:]
+    # The module's docstring has the proof: n u for the sum, and 8 u for a displacement, for which
+    # 16 u is taken.
     rounding = u * (16 + term_count)
     slope_error = rounding * steepness.slope * slope_size
     second_error = rounding * steepness.bend * second_size

@@ -168,6 +168,7 @@ class Blobs(Formula):
             return float(gradient_bounds.sum())
         # A cell's sum is a difference of two running sums over the entries of all lists.
         running_sums = np.concatenate([[0.0], np.cumsum(gradient_bounds[lists.entries])])
+        # (1e-6 covers the rounding of the sums.)
         return float((running_sums[lists.starts[1:]] - running_sums[lists.starts[:-1]]).max()) * (
             1 + 1e-6
         )

@@ -498,9 +498,12 @@ def outline_distance_jet(nearest: Callable[[Real, Real], OutlineSample], x: Jet,
     used.
     """
     # The jets at the start of the piece; at a point, the jets themselves.
-    starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in (x, y)]
+    starts = [
+        coordinate if coordinate.jet_at_start is None else coordinate.jet_at_start
+        for coordinate in (x, y)
+    ]
     zero = 0 * x.piece_length
-    u, v = (zero + coord.value.midpoint for coord in starts)
+    u, v = (zero + coordinate.value.midpoint for coordinate in starts)
     nearest_sample = nearest(u, v)
     # A bound of the error of the coordinates at the start.
     input_error = zero + starts[0].value.radius + starts[1].value.radius

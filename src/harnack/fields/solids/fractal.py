@@ -113,8 +113,8 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     weights: list[tuple[tuple[Any, Any], ...]] = []
     # For each axis the weights of the near and of the far end, and their first two derivatives.
     for fraction in t:
-        s, ds, dds = fade(kind, fraction)
-        weights.append(((1 - s, s), (-ds, ds), (-dds, dds)))
+        far, far_slope, far_second = fade(kind, fraction)
+        weights.append(((1 - far, far), (-far_slope, far_slope), (-far_second, far_second)))
     value: Any = 0.0
     gradient: list[Any] = [0.0] * 3
     hessian: list[Any] = [0.0] * 6
@@ -136,15 +136,17 @@ def cell_noise(kind: Fade, t: Any, vectors: Any) -> tuple[Any, list[Any], list[A
     for corner, vector in zip(CORNERS, vectors, strict=True):
         # The noise is the sum of weight times ramp; derivatives follow by the product rule.
         ramp = sum(vector[k] * (t[k] - corner[k]) for k in range(3))
-        w = weight(corner, [0, 0, 0])
-        value = value + w * ramp
-        dw = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
+        corner_weight = weight(corner, [0, 0, 0])
+        value = value + corner_weight * ramp
+        weight_slopes = [weight(corner, [int(i == k) for i in range(3)]) for k in range(3)]
         for k in range(3):
-            gradient[k] = gradient[k] + (w * vector[k] + dw[k] * ramp)
+            gradient[k] = gradient[k] + (corner_weight * vector[k] + weight_slopes[k] * ramp)
         for m, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
             orders = [int(i == k) + int(j == k) for k in range(3)]
             hessian[m] = hessian[m] + (
-                dw[i] * vector[j] + dw[j] * vector[i] + weight(corner, orders) * ramp
+                weight_slopes[i] * vector[j]
+                + weight_slopes[j] * vector[i]
+                + weight(corner, orders) * ramp
             )
     return value, gradient, hessian
 

@@ -190,7 +190,7 @@ class _JuliaEvaluator(Evaluator):
         the n-th iterates of these orbits are from q_n; `slopes` holds d_n, a bound of the
         derivatives of these iterates by the starting point; `min_q` holds m_n, a lower bound of
         their absolute values; and `rates` holds g_n, a bound of the derivatives of the logarithms
-        of these. `jac` is the Jacobian of q_n with respect to x, y and z. `rounded` is the bound of
+        of these. `jacobian` is that of q_n with respect to x, y and z. `rounded` is the bound of
         the rounding of one iteration.
         """
         c, size, b = self.c, self.size, self.escape_radius
@@ -200,7 +200,7 @@ class _JuliaEvaluator(Evaluator):
         epsilon = 2 * float(dr.epsilon(real))  # the machine epsilon
         zero, ones = 0 * p.x, 0 * p.x + 1
         q = [p.x, p.y, p.z, zero + self.fourth_coordinate]
-        jac = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]
+        jacobian = [ones, zero, zero, zero, ones, zero, zero, zero, ones, zero, zero, zero]
         change = [zero + r for r in radii]
         slopes = [ones for _ in radii]
         start = dr.sqrt(_squared_norm(q))
@@ -214,16 +214,16 @@ class _JuliaEvaluator(Evaluator):
             entries of its Jacobian with respect to x, y and z, row by row; and four bounds for each
             radius, `change`, `slopes`, `min_q` and `rates`, which `_orbit` explains.
             """
-            q, jac = list(state[:4]), state[4:16]
+            q, jacobian = list(state[:4]), state[4:16]
             change, slopes, min_q, rates = _split_in_four(state[16:])
-            next_jac: list[Any] = [None] * 12
+            next_jacobian: list[Any] = [None] * 12
             for k in range(3):
                 # Column k of the Jacobian: a is the real part of the derivative of q_n, v the other
                 # three. The derivative of q^2 follows from the formula of `next_q`.
-                a, *v = (jac[3 * i + k] for i in range(4))
-                next_jac[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
+                a, *v = (jacobian[3 * i + k] for i in range(4))
+                next_jacobian[k] = 2 * (q[0] * a - (q[1] * v[0] + q[2] * v[1] + q[3] * v[2]))
                 for i in range(3):
-                    next_jac[3 * (i + 1) + k] = 2 * (q[0] * v[i] + q[i + 1] * a)
+                    next_jacobian[3 * (i + 1) + k] = 2 * (q[0] * v[i] + q[i + 1] * a)
             square = _squared_norm(q)
             norm = dr.sqrt(square) * (1 + 4 * epsilon)
             # The error of each component of q^2 + c is a few roundings of |q|^2 + |c|.
@@ -244,7 +244,15 @@ class _JuliaEvaluator(Evaluator):
                 by_rate = dr.select(factor > 0, 2 * rate / factor * (1 + 4 * epsilon), dr.inf)
                 next_min_q.append(fmax(fmax(next_norm - e, 0), next_m))
                 next_rates.append(fmin(by_rate, d / fmax(next_norm - e, 0) * (1 + epsilon)))
-            return n + 1, *next_q, *next_jac, *next_change, *next_slopes, *next_min_q, *next_rates
+            return (
+                n + 1,
+                *next_q,
+                *next_jacobian,
+                *next_change,
+                *next_slopes,
+                *next_min_q,
+                *next_rates,
+            )
 
         def is_active(n: Any, *state: Any) -> Any:
             """A mask of the lanes on which iterations are left and the orbit has not escaped. n,
@@ -252,9 +260,9 @@ class _JuliaEvaluator(Evaluator):
             return (n < self.iterations) & (_squared_norm(state[:4]) <= escape * escape)
 
         index = dr.uint32_array_t(real)
-        begin = (dr.zeros(index, dr.width(p)), *q, *jac, *change, *slopes, *min_q, *rates)
+        begin = (dr.zeros(index, dr.width(p)), *q, *jacobian, *change, *slopes, *min_q, *rates)
         n, *state = dr.while_loop(begin, is_active, iterate, label="quaternion Julia set")
-        q, jac = state[:4], state[4:16]
+        q, jacobian = state[:4], state[4:16]
         change, slopes, min_q, rates = _split_in_four(state[16:])
         square = _squared_norm(q)
         norm = dr.sqrt(square)
@@ -270,7 +278,7 @@ class _JuliaEvaluator(Evaluator):
         # The gradient of log|q| is q/|q|^2, times the Jacobian.
         scale = dr.select(is_floor, 0, factor / square)
         gradient = type(p)(
-            *(scale * sum(q[i] * jac[3 * i + k] for i in range(4)) for k in range(3))
+            *(scale * sum(q[i] * jacobian[3 * i + k] for i in range(4)) for k in range(3))
         )
         cut = b * (math.exp(-1.0) * (1 - 1e-6))  # f is constant where |q_N| is smaller
         constants: list[Real] = []

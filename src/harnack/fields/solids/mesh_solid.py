@@ -473,11 +473,14 @@ def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
     """
     coordinates = (x, y, z)
     # The jets at the start of the piece; at a point, the jets themselves.
-    starts = [coord if coord.jet_at_start is None else coord.jet_at_start for coord in coordinates]
+    starts = [
+        coordinate if coordinate.jet_at_start is None else coordinate.jet_at_start
+        for coordinate in coordinates
+    ]
     zero = 0 * x.piece_length
-    q = backend_of(zero).Array3f(*(zero + coord.value.midpoint for coord in starts))
+    q = backend_of(zero).Array3f(*(zero + coordinate.value.midpoint for coordinate in starts))
     sample, edge, on_edge, at_vertex = data.sample_with_feature(q)
-    input_error = sum((coord.value.radius for coord in starts), zero)
+    input_error = sum((coordinate.value.radius for coordinate in starts), zero)
     error = sample.value_error + input_error
     # True where the coordinates are ranges, and not numbers with their rounding: at other points of
     # the ranges another face may be nearest.
@@ -493,21 +496,25 @@ def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
         """
         return [
             # (1e-5 covers the rounding of the length.)
-            dr.sqrt(sum(dr.square(zero + coord.first_derivatives[i].max_abs) for coord in jets))
+            dr.sqrt(
+                sum(
+                    dr.square(zero + coordinate.first_derivatives[i].max_abs) for coordinate in jets
+                )
+            )
             * (1 + 1e-5)
             for i in range(len(x.first_derivatives))
         ]
 
     errors = Interval(zero - sample.gradient_error, zero + sample.gradient_error)
     # The components of the gradient with their error, as intervals.
-    slopes = [Interval.point(coord) + errors for coord in sample.gradient]
+    slopes = [Interval.point(coordinate) + errors for coordinate in sample.gradient]
     first: list[Interval] = []
     # First derivatives: by the chain rule, narrowed by the Lipschitz constant; on ranges of points
     # by the Lipschitz constant alone.
     for i, limit in enumerate(speeds(starts)):
         rate = Interval(0.0, 0.0)
-        for slope, coord in zip(slopes, starts, strict=True):
-            rate = rate + slope * coord.first_derivatives[i]
+        for slope, coordinate in zip(slopes, starts, strict=True):
+            rate = rate + slope * coordinate.first_derivatives[i]
         lipschitz_range = Interval(-limit, limit)
         narrowed = rate.intersect(lipschitz_range)
         lower, upper = (
@@ -524,8 +531,8 @@ def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
         jets: the jets of the three coordinates, which are functions of one or more variables.
         """
         total = Interval(0.0, 0.0)
-        for coord, jet in zip(direction, jets, strict=True):
-            total = total + Interval.point(coord) * jet.first_derivatives[i]
+        for coordinate, jet in zip(direction, jets, strict=True):
+            total = total + Interval.point(coordinate) * jet.first_derivatives[i]
         return total
 
     count = range(len(x.first_derivatives))
@@ -540,14 +547,14 @@ def mesh_distance_jet(data: _MeshData, x: Jet, y: Jet, z: Jet) -> Jet:
     second: list[Interval] = []
     for k, (i, j) in enumerate(starts[0].hessian_indices()):
         across = -(gradient_rates[i] * gradient_rates[j])
-        for coord in starts:
-            across = across + coord.first_derivatives[i] * coord.first_derivatives[j]
+        for coordinate in starts:
+            across = across + coordinate.first_derivatives[i] * coordinate.first_derivatives[j]
         across = across - edge_rates[i] * edge_rates[j] * Interval.point(
             dr.select(on_edge, 1.0, 0.0)
         )
         rate = Interval.point(zero + curvature).widened(1e-5 + sample.gradient_error) * across
-        for slope, coord in zip(slopes, starts, strict=True):
-            rate = rate + slope * coord.second_derivatives[k]
+        for slope, coordinate in zip(slopes, starts, strict=True):
+            rate = rate + slope * coordinate.second_derivatives[k]
         second.append(rate + Interval(-range_margin, range_margin))
     start = Jet(value, tuple(first), tuple(second), piece_length=starts[0].piece_length)
     if x.jet_at_start is None:
