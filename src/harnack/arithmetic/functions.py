@@ -532,6 +532,7 @@ sqrt = ElementaryFunction("sqrt", _sqrt, dr.sqrt, np.sqrt, _POSITIVE, is_steep=T
 reciprocal = ElementaryFunction(
     "reciprocal", _reciprocal, lambda x: 1 / x, lambda x: 1 / x, is_steep=True, has_pole=True
 )
+# (`sincos` returns the sine and the cosine.)
 sin = ElementaryFunction("sin", _sine, lambda x: sincos(x)[0], np.sin)
 cos = ElementaryFunction("cos", _cosine, lambda x: sincos(x)[1], np.cos)
 tan = ElementaryFunction(

@@ -83,38 +83,41 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
     purpose = "Dask arrays"
     delayed = import_cluster_package("dask", purpose).delayed
     dask_array = import_cluster_package("dask.array", purpose)
-    dask_args = {name: array for name, array in arguments.items() if is_dask_array(array)}
-    for name in dask_args.keys() - set(names):
+    dask_arguments = {name: array for name, array in arguments.items() if is_dask_array(array)}
+    for name in dask_arguments.keys() - set(names):
         raise TypeError(f"{name} cannot be a Dask array: call its method compute() first")
-    dask_args = _align_blocks(
-        dask_array, dask_args, {name: arguments[name] for name in names if name in arguments}
+    dask_arguments = _align_blocks(
+        dask_array, dask_arguments, {name: arguments[name] for name in names if name in arguments}
     )
-    constants = {name: array for name, array in arguments.items() if name not in dask_args}
-    for name, array in dask_args.items():
+    constants = {name: array for name, array in arguments.items() if name not in dask_arguments}
+    for name, array in dask_arguments.items():
         if array.dtype.kind not in "iuf":
             raise TypeError(f"{name} must hold real numbers, not {array.dtype}")
     call = functools.partial(call, **constants)
     # A call with no points gives the type of the result; wrong settings raise here as well.
     empty_result = call(
-        **{name: np.zeros((0, *array.shape[1:]), array.dtype) for name, array in dask_args.items()}
+        **{
+            name: np.zeros((0, *array.shape[1:]), array.dtype)
+            for name, array in dask_arguments.items()
+        }
     )
     empty_arrays = _arrays_of(empty_result)
     serialized = SerializedObject.serialize(call, purpose)
     # The results' names in Dask: equal for equal calls of equal arrays.
     result_hash = content_hash(
-        (serialized.content_hash, [(name, array.name) for name, array in dask_args.items()]),
+        (serialized.content_hash, [(name, array.name) for name, array in dask_arguments.items()]),
         purpose,
     )
     # traverse=False: Dask need not look for Dask arrays in it.
     sent_call = delayed(serialized, name=f"harnack-{serialized.content_hash}", traverse=False)
     # pure=False: Dask need not compute names from arguments, as names are given below.
     run_block = delayed(_run_block, pure=False)
-    block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_args.values()]
-    lengths: tuple[int, ...] = next(iter(dask_args.values())).chunks[0]
+    block_lists = [array.to_delayed().reshape(-1).tolist() for array in dask_arguments.values()]
+    lengths: tuple[int, ...] = next(iter(dask_arguments.values())).chunks[0]
     outputs: dict[str, list[Any]] = {name: [] for name in empty_arrays}
     # One delayed call for each block; it returns the result's arrays by name.
     for block_index, blocks in enumerate(zip(*block_lists, strict=True)):
-        block_of_argument = dict(zip(dask_args, blocks, strict=True))
+        block_of_argument = dict(zip(dask_arguments, blocks, strict=True))
         # The third argument is the index of the first row of the block.
         output = run_block(
             sent_call,
@@ -131,12 +134,12 @@ def _map_blocks(call: Callable[..., Any], names: tuple[str, ...], arguments: dic
 
 
 def _align_blocks(
-    dask_array: Any, dask_args: dict[str, Any], others: Mapping[str, Any]
+    dask_array: Any, dask_arguments: dict[str, Any], others: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Divide Dask arrays into the same blocks of rows. Returns them by name.
 
     dask_array: the module dask.array.
-    dask_args: the Dask arrays by name; the blocks are those of the first array.
+    dask_arguments: the Dask arrays by name; the blocks are those of the first array.
     others: further arguments by name; an array among them with as many rows becomes a Dask array
         too.
 
@@ -144,7 +147,7 @@ def _align_blocks(
         ValueError: the arrays have different or unknown lengths, or a shape other than (n, 3) or
             (n,).
     """
-    first_name, reference = next(iter(dask_args.items()))
+    first_name, reference = next(iter(dask_arguments.items()))
     if reference.ndim == 0:
         raise ValueError(f"{first_name} must have shape (n, 3) or (n,), not ()")
     # Unknown lengths are NaN in Dask.
@@ -154,11 +157,11 @@ def _align_blocks(
             "compute_chunk_sizes() first"
         )
     count = reference.shape[0]
-    aligned = dict(dask_args)
+    aligned = dict(dask_arguments)
     for name, array in others.items():
         shape = np.shape(array)
         # A number or a single point or direction belongs to all rows.
-        if name not in dask_args and shape not in ((), (3,)) and shape[0] == count:
+        if name not in dask_arguments and shape not in ((), (3,)) and shape[0] == count:
             aligned[name] = dask_array.from_array(np.asarray(array), chunks=-1)  # one block
     for name, array in aligned.items():
         if array.ndim not in (1, 2) or (array.ndim == 2 and array.shape[1] != 3):

@@ -120,7 +120,8 @@ class ClipCurveDescent:
             has_best = dr.isfinite(nearest)
             is_new_face = dr.dot(trial.normal, normal) < 1 - _SAME_FACE
             face_gap = fmax(face_offset - dr.dot(face_normal, best), 0)
-            # At a corner the point in the other face may be a little farther from x.
+            # At a corner the point in the other face may be a little farther from x: by some of the
+            # gap to that face and of rounding.
             turns_corner = (
                 (corner == _TURNING)
                 & is_new_face
@@ -186,8 +187,8 @@ class ClipCurveDescent:
                 dr.select(is_corrected, tries + 1, 0),
             )
             return (
-                y, best, nearest, w, tangent, second, normal, face_normal, face_offset, corner, factor,
-                tries, k + 1, active,
+                y, best, nearest, w, tangent, second, normal, face_normal, face_offset, corner,
+                factor, tries, k + 1, active,
             )  # fmt: skip
 
         def is_active(*state: Any) -> Mask:

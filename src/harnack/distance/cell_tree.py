@@ -211,6 +211,7 @@ class CellTree:
         # (4 is the place of the surface point in a record.)
         upper_bound = (1 + 1e-9) * dr.sqrt(squared_distance_in_nearby_leaf(self.tree, x, 4))
         start = fmin(upper_bound, limit), vector(FAR_SENTINEL)
+        # The state is (estimated distance, surface point); the walk is limited by the first.
         return self._walk(x, visit_cell, start, lambda state: dr.square(state[0]))[1]
 
     def closer_candidates(
@@ -370,7 +371,13 @@ class _CellRecord:
         """Make the record that is stored in a row of 16 numbers, in the order in which
         `CellTree.of` writes them. vector: the type of 3-vectors."""
         return cls(
-            vector(*row[:3]), row[3], vector(*row[4:7]), row[7], vector(*row[8:11]), *row[11:16]
+            # In the order of the attributes.
+            vector(*row[:3]),
+            row[3],
+            vector(*row[4:7]),
+            row[7],
+            vector(*row[8:11]),
+            *row[11:16],
         )
 
     @property

@@ -566,10 +566,10 @@ class FormulaOnRay:
 
 
 def with_device_numbers(field: Any, backend: Backend) -> Any:
-    """A copy of a field that is a dataclass, in which its numbers are kernel parameters of the
-    backend, and the formulas of its attributes that are fields are those on the backend
-    (`Formula.formula_on`). (A kernel parameter can change without compiling the kernel again.)
-    Attributes that are named in `Formula.literals` are left as they are."""
+    """A copy of a field that is a dataclass, for a backend. Attributes that are numbers become
+    kernel parameters, which can change without compiling the kernel again; attributes that are
+    fields get their formula on the backend (`Formula.formula_on`). Attributes that are named in
+    `Formula.literals` are left as they are."""
     other = copy.copy(field)
     literals: tuple[str, ...] = getattr(field, "literals", ())
     for entry in dataclasses.fields(cast("Any", field)) if dataclasses.is_dataclass(field) else ():

@@ -86,6 +86,7 @@ def _edge_lengths(x: FloatArray) -> FloatArray:
 def _is_flat(x: FloatArray) -> bool:
     """Whether the vertices x (n, 3) of a polygon of size 1 lie within PLANE_TOLERANCE of a common
     plane."""
+    # The third result of `svd`: the directions in which the vertices vary most, less and least.
     axes: FloatArray = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
     # The last axis is the direction in which the vertices vary least.
     return bool(np.ptp(x @ axes[2]) <= PLANE_TOLERANCE)

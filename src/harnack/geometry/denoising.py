@@ -306,6 +306,7 @@ def _neighbors(tree: Any, points: FloatArray, count: int) -> Indices:
     def find_slice(rows: slice) -> None:
         """Find the indices of the neighbors of the points in a slice of all points, and store them
         in the array `index` of the enclosing function."""
+        # (`query` returns distances and indices.)
         index[rows] = tree.query(points[rows], k=count)[1].reshape(-1, count)
 
     parallel_over_slices(find_slice, len(points))

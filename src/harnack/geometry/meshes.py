@@ -77,6 +77,7 @@ def zero_area_faces(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> IntArray:
     Raises:
         MeshError: the mesh is not valid, apart from faces of zero area (see `validate_mesh`).
     """
+    # (The first result is the mask of faces of zero area.)
     return np.flatnonzero(_measure_faces(*_checked_arrays(vertices, faces))[0])
 
 

@@ -37,4 +37,5 @@ def connected_groups(pairs: IntArray, count: int) -> IntArray:
 
     sparse, csgraph = cast("Any", scipy.sparse), cast("Any", csgraph_module)
     joined = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    # (The first result is the number of components.)
     return np.asarray(csgraph.connected_components(joined, directed=False)[1], np.int64)

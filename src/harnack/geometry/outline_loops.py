@@ -257,5 +257,6 @@ def scale_for_clipper(outline: Sequence[FloatArray]) -> tuple[list[FloatArray], 
     """Multiply loops by a power of two that is so large that Clipper2's rounding to 1e-8 hardly
     matters. Returns the scaled loops, and the factor."""
     largest = max(float(np.abs(loop).max()) for loop in outline)
+    # The second result of `frexp` is the exponent of two.
     scale = 2.0 ** (math.frexp(_CLIPPER_SIZE)[1] - math.frexp(largest)[1])
     return [np.ascontiguousarray(loop * scale) for loop in outline], scale

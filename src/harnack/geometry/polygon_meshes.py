@@ -438,4 +438,5 @@ def _clusters(
         # Clusters without triangles, whose centers are infinite, are dropped.
         centers = centers[weight > 0]
         count = len(centers)
+    # (`query` returns distances and indices.)
     return kd_tree(centers).query(points)[1]

@@ -402,6 +402,8 @@ def _are_beside_edge(a: Corners, b: Corners, shared_count: Real) -> Mask:
                 value, error = dr.dot(m, offset), rounding * dr.norm(offset) + _UNDERFLOW
                 return value > error, value < -error
 
+            # Proved negative for the third corner; proved positive for the corners of the other
+            # triangle.
             is_third_behind = sides_of(x)[1]
             are_corners_beyond = [sides_of(corner - origin)[0] for corner in second]
             # The shared corners come first: e has to start at corner 0, or to be the edge (0, 1).

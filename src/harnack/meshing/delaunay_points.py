@@ -68,6 +68,7 @@ class RefinementBalls:
         """
         if not len(centers):
             return np.zeros(0, np.bool_)
+        # (`query` returns distances and indices.)
         distance: FloatArray = kd_tree(self.points).query(centers)[0]
         return distance < self.radius + radii
 

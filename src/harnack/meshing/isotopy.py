@@ -489,5 +489,6 @@ def _distances(points: FloatArray, boundary: BoundaryCurve) -> FloatArray:
     # Nine points, an eighth of the edge apart.
     fraction = np.linspace(0, 1, 9)[:, None, None]
     curve_points: FloatArray = (a + fraction * (b - a)).reshape(-1, 3)
+    # (`query` returns distances and indices.)
     distances: FloatArray = kd_tree(curve_points).query(points)[0]
     return distances

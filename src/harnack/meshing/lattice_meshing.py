@@ -181,6 +181,7 @@ def check_no_missed_parts(
     # Keep the points that are far from the mesh: near them, triangles are missing.
     if len(faces) and len(x):
         mesh_points = np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        # (`query` returns distances and indices.)
         x = x[kd_tree(mesh_points).query(x)[0] > _MIN_MESH_DISTANCE * size]
     if elsewhere is not None and len(x):
         x = x[elsewhere(x) <= 0]

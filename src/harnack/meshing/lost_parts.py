@@ -332,6 +332,7 @@ def _bound_of_distances(points: FloatArray, triangles: FloatArray) -> float:
         return math.inf
     mesh_points = np.concatenate([triangles.reshape(-1, 3), triangles.mean(axis=1)])
     tree = kd_tree(mesh_points, is_balanced=False)
+    # (`query` returns distances and indices.)
     return float(tree.query(points)[0].max())
 
 

@@ -402,6 +402,7 @@ def _unite_bodies(
             be computed.
     """
     vertices, faces = intended.vertices, intended.oriented
+    # Edges that do not cancel between faces (the first result) are open.
     if len(singular_edges(faces)[0]):
         raise MeshError("the mesh is not closed")
     if _bounds_a_solid(vertices, faces):

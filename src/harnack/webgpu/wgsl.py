@@ -371,7 +371,7 @@ def _float_class_test(classes: int, x: str) -> str:
 
 
 def _conversion(operation: Operation, name: str, source: str, x: str) -> str:
-    """Return the WGSL expression that converts x to the type of the operation `operation`.
+    """Return the WGSL expression of a conversion, which converts x to the type of the operation.
 
     name: the LLVM conversion, such as "sitofp" (signed integer to float).
     source: the type of x: "f32", "u32" or "bool".

@@ -83,9 +83,9 @@ class HarmonicPromises:
     rounding: bounds of the rounding of value and gradient.
 
     The radius R. The paper uses the fixed ball |y| <= 1.25. Near level 0 steps are shortened by the
-    second-order term of the bound, which is proportional to (range on |y| <= |p|+R)/R^2, so R is
-    chosen to minimize that: it is 2|p|/(l-2) for a single degree l > 2. (By experiment this takes
-    about two thirds of the evaluations that the fixed ball takes.)
+    second-order term of the bound, which is proportional to (range on |y| <= |p|+R)/R^2, and R is
+    chosen to minimize this quotient. For a single degree l > 2, R is 2|p|/(l-2). (By experiment
+    this takes about two thirds of the evaluations that the fixed ball takes.)
 
     Zeros of high order. Where f vanishes to a high order, at the origin or along the z axis, R goes
     to zero with the distance from there, and the range on the ball goes to zero as f does. So every

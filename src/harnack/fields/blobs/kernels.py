@@ -181,8 +181,8 @@ class CompactKernel(BlobKernel):
     in units of the support's radius. Its second derivative is continuous (Aydinlilar and Zanni
     2023, eq. 7 with n = 6).
 
-    support: the radius at which a blob ends, divided by the blob's radius, at which a blob of
-        weight 1 has the value 1.
+    support: the radius at which a blob ends, divided by the radius of the blob (at which a blob of
+        weight 1 has the value 1).
 
     Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
     line's part inside the support is |x| <= S. With w = S^2 - x^2,
@@ -270,8 +270,8 @@ class SexticKernel(BlobKernel):
     squared distance from the center in units of the support's radius. With w = 1 - q it is w^2 (5 +
     4w)/9 (Wyvill, McPheeters and Wyvill 1986; Hart 1996, appendix D).
 
-    support: the radius at which a blob ends, divided by the blob's radius, at which a blob of
-        weight 1 has the value 1.
+    support: the radius at which a blob ends, divided by the radius of the blob (at which a blob of
+        weight 1 has the value 1).
 
     Let f(x) be the kernel along a line, at the position x from the point nearest to the center. The
     line's part inside the support, the chord, is |x| <= S. With w = S^2 - x^2,
@@ -382,8 +382,8 @@ class CubicKernel(BlobKernel):
     """The cubic kernel of soft objects, k = 1 - 3 r^2 + 2 r^3 = (1 - r)^2 (1 + 2r), where r =
     sqrt(q) is the distance from the center in units of the support's radius (Hart 1996, eq. 36).
 
-    support: the radius at which a blob ends, divided by the blob's radius, at which a blob of
-        weight 1 has the value 1.
+    support: the radius at which a blob ends, divided by the radius of the blob (at which a blob of
+        weight 1 has the value 1).
 
     Let f(x) be the kernel on a line at the distance h from the center, at the position x from the
     point nearest to the center. With r^2 = h^2 + x^2,

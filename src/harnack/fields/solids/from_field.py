@@ -264,7 +264,10 @@ def field_jet(evaluator: Evaluator, x: Jet, y: Jet, z: Jet, name: str) -> Jet:
     if rows is not None:
         is_point = offset <= _MAX_POINT_ROUNDINGS * float(dr.epsilon(type(q.x))) * max_norm(q)
         second_error = dr.select(
-            is_point, fmin(second_error, evaluator.derivative_errors(q, sample)[1]), second_error
+            # The second result bounds the error of the Hessian.
+            is_point,
+            fmin(second_error, evaluator.derivative_errors(q, sample)[1]),
+            second_error,
         )
 
     def derivative_ranges(

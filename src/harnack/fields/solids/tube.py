@@ -278,6 +278,7 @@ class _TubeEvaluator(Evaluator):
     data: _TubeData
 
     def evaluate(self, p: Vec3) -> Sample:
+        # Without a direction (None) and without knots there are no bounds along a ray.
         return self._sample_with_bounds(p, None, ())[0]
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
