@@ -190,7 +190,7 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
 
 
 def _wronskian_term(
-    xs: list[Jet], values: list[Interval], inverse_norm: Interval, i: int, j: int
+    functions: list[Jet], values: list[Interval], inverse_norm: Interval, i: int, j: int
 ) -> Interval:
     """The range of the sum over pairs k < m of w_km,i w_km,j / N^3, where N is the Euclidean norm
     of functions x_k. It is the part of N's second derivative by the variables i and j that the
@@ -199,14 +199,14 @@ def _wronskian_term(
     w_km,i is the function x_k x_m,i - x_m x_k,i, where ",i" denotes the derivative by the variable
     i.
 
-    xs: the functions x_k.
+    functions: the functions x_k.
     values: the ranges of their values.
     inverse_norm: the range of 1/N.
     i, j: the two variables of the second derivative.
     """
     parts: list[Interval] = []
-    for k, m in itertools.combinations(range(len(xs)), 2):
-        pair = xs[k], xs[m], values[k], values[m]
+    for k, m in itertools.combinations(range(len(functions)), 2):
+        pair = functions[k], functions[m], values[k], values[m]
         a = wronskian_range(*pair, i) * inverse_norm
         parts.append(a.square() if i == j else a * (wronskian_range(*pair, j) * inverse_norm))
     return _total(parts) * inverse_norm

@@ -113,7 +113,7 @@ class CreaseSearch:
         others it starts at the closest point so far, and at the end of the operand's own descent.
         """
         best, unlimited = closest.copy(), np.full(len(points), np.inf)
-        # (The first result of `descend` is the point at its end.)
+        # (The first result of `descend` is the closest points.)
         feet = [o.descend(points, points, unlimited)[0] for o in self.operands]
         for foot in feet:
             self._update(points, best, foot)

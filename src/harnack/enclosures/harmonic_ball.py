@@ -314,7 +314,7 @@ class _ChordCondition:
         return cls(gap, mean, dimension)
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """Return k(0) and k'(0)."""
+        """Return k(0) and k'(0), of the Taylor series of k. No proof relies on them."""
         n, k = self.dimension, self.dimension - 1
         first = n * self.mean - k
         second = n * (1 - self.mean) - 0.5 * (k - 1) / (k * k) * first * first
@@ -362,7 +362,7 @@ class _JensenCondition:
     dimension: int
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """Return k(0) and k'(0)."""
+        """Return k(0) and k'(0), of the Taylor series of k. No proof relies on them."""
         n, m, weight = self.dimension, self.mean, 1 - self.gap
         second = 1 + 0.5 * n * (1 + (n - 2) * m * m)
         return -weight * n * m, dr.fma(weight, second, self.gap)
@@ -516,7 +516,7 @@ class _CapCondition:
     shift: Real
 
     def expansion_at_zero(self) -> tuple[Real, Real]:
-        """Return k(0) and k'(0)."""
+        """Return k(0) and k'(0), of the Taylor series of k. No proof relies on them."""
         x, y, weight = self.rest - self.shift, self.rest + self.shift, 1 - self.gap
         second = 2.5 - 0.75 * dr.fma(x, x, y * y) - x * y + 2 * self.shift * self.shift
         return 3 * weight * self.shift, dr.fma(weight, second, self.gap)

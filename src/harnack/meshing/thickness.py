@@ -96,8 +96,10 @@ class WallThickness:
         if not len(ends):
             return result
         centers = self.vertices[self.faces[rows]].mean(axis=1)
+        # By 2 d tan(a/2) <= `_REACH` times the thickness.
         limits = 0.5 * _REACH * self.values[rows]
         count = min(_NEAR_EDGES, len(ends))
+        # The edges with the nearest middles, a column for each.
         _, nearest = kd_tree(ends.mean(axis=1)).query(centers, k=[*range(1, count + 1)])
         for k in range(count):
             start, edge = ends[nearest[:, k], 0], ends[nearest[:, k], 1] - ends[nearest[:, k], 0]

@@ -211,6 +211,7 @@ class CosineBounds:
         low, high = np.zeros(3), np.ones(3)
         for axis in range(3):
             other_axes = tuple(a for a in range(3) if a != axis)
+            # The slices of cells across this axis that may have a level.
             indices = np.flatnonzero(is_met.any(axis=other_axes))
             low[axis], high[axis] = indices[0] / len(is_met), (indices[-1] + 1) / len(is_met)
         return low, high
@@ -479,8 +480,10 @@ class _CellCurvatures:
         position, index = share * float(self.count), self.backend.UInt32(0)
         radius: Real = dr.inf
         for axis in (2, 1, 0):
+            # The index of a cell is i + count (j + count k).
             cell = clamp(dr.floor(position[axis]), 0, self.count - 1)
             index = index * self.count + self.backend.UInt32(cell)
+            # The cell's neighbors reach one cell beyond it on both sides.
             offset = position[axis] - cell
             radius = fmin((1 + fmin(offset, 1 - offset)) * self.sides[axis], radius)
         constant = dr.gather(self.backend.Float, self.bounds, index)

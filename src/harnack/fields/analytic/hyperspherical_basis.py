@@ -51,6 +51,7 @@ _RESOLUTION = 0.1
 def norm(l: int, j: int) -> float:  # noqa: E741
     """The factor N_lj of the polynomial P_ljm, for which the integral of P_ljm^2 over S^3 is 1."""
     n, k = l - j, j + 1
+    # The integral of C_n^k(w)^2 (1 - w^2)^(k - 1/2) over [-1, 1]; over S^2 that of Y_jm^2 is 1.
     square = math.pi * 2.0 ** (1 - 2 * k) * math.factorial(n + 2 * k - 1)
     square /= math.factorial(n) * (n + k) * math.factorial(k - 1) ** 2
     return 1 / math.sqrt(square)

@@ -623,6 +623,7 @@ def _hessian_form(hessian: list[Interval], jets: list[Jet], i: int, j: int) -> I
     terms: list[Interval] = []
     for m, (a, b) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
         across = jets[a].first_derivatives[i] * jets[b].first_derivatives[j]
+        # Off the diagonal, the entries H_ab and H_ba are the same.
         if a != b:
             across = across + jets[b].first_derivatives[i] * jets[a].first_derivatives[j]
         terms.append(hessian[m] * across)

@@ -381,6 +381,7 @@ class _OutlineQuery:
         """
         if self.velocity is None:
             return bounds
+        # The direction of the vector is off by at most 2 error / distance.
         slope = (x * self.velocity[0] + y * self.velocity[1]) / distance - 2 * error / distance
         rounding = 4 * self.unit * distance
         return min_with_tangent(bounds, self.knots, distance - error, slope, rounding, self.unit)
