@@ -325,13 +325,13 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
     smaller = minimum(a, b)
     # Where the smaller one is at least r, `near` is r; elsewhere the second term is 0.
-    both = near + maximum(smaller - radius, 0.0)
-    if not isinstance(smaller, Jet) or not isinstance(both, Jet):
-        return both
+    blend = near + maximum(smaller - radius, 0.0)
+    if not isinstance(smaller, Jet) or not isinstance(blend, Jet):
+        return blend
     # Where only one of the two forms applies, the kinks of the other do not matter.
     excess = smaller - radius
-    both = near.select(excess.value.upper < 0, both)
-    return smaller.select(excess.value.lower > 0, both)
+    blend = near.select(excess.value.upper < 0, blend)
+    return smaller.select(excess.value.lower > 0, blend)
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
@@ -358,11 +358,11 @@ def orthogonal_intersection(*sides: Any) -> Any:
     """
     largest = maximum(*sides)
     outside = norm(*(maximum(side, 0.0) for side in sides))
-    both = outside + minimum(largest, 0.0)
-    if not isinstance(both, Jet):
-        return both
+    distance = outside + minimum(largest, 0.0)
+    if not isinstance(distance, Jet):
+        return distance
     # Outside of the set the minimum is 0.
-    both = outside.select(largest.value.lower > 0, both)
+    distance = outside.select(largest.value.lower > 0, distance)
     # Where no two sides can be positive, as on a face, the distance is the largest of them: the
     # kinks of the norm at 0 and of the minimum do not matter.
     highs = [side.value.upper if isinstance(side, Jet) else side for side in sides]
@@ -370,4 +370,4 @@ def orthogonal_intersection(*sides: Any) -> Any:
         fmax, [fmin(a, b) for a, b in itertools.combinations(highs, 2)]
     )
     is_finite = dr.isfinite(functools.reduce(lambda a, b: a + b, highs))
-    return largest.select((second_largest < 0) & is_finite, both)
+    return largest.select((second_largest < 0) & is_finite, distance)

@@ -170,25 +170,27 @@ def _repaired(facts: dict[str, Any], old: int, new: int) -> str:
     parts = _counted(len(facts["parts"]), "part")
     if facts["dropped"]:
         parts += f", of which {facts['dropped']:,} dropped"
-    why = "" if facts["why"] is None else f" since {facts['why']}"
+    since = "" if facts["why"] is None else f" since {facts['why']}"
     if facts["stage"] == "remeshed":
         return (
-            f"made anew: {new:,} triangles in place of {old:,}{why}; {facts['far']:,} vertices "
+            f"made anew: {new:,} triangles in place of {old:,}{since}; {facts['far']:,} vertices "
             f"and centers are beyond the tolerance, all are within {facts['within']:.2g}; {parts}"
         )
     if facts["stage"] == "boolean_union":
-        return f"bodies united: {new:,} triangles around them, of {old:,}{why}; {parts}"
+        return f"bodies united: {new:,} triangles around them, of {old:,}{since}; {parts}"
     added = f"{_counted(facts['holes'], 'hole')}, {facts['patches']:,} triangles added"
     if facts["stage"] == "filled":
         return f"{added} to {old:,}, which are all kept; {parts}"
-    start, remaining = f"kept what is sound{why}", facts["kept"]
+    start, remaining = f"kept what is sound{since}", facts["kept"]
     if facts["stage"] == "welded":
         remaining = facts["joined"]
-        start = f"corners joined that moved up to {facts['moved']:.2g}{why}"
-    out = ", ".join(f"{count:,} {reason}" for reason, count in facts["left_out"].items() if count)
+        start = f"corners joined that moved up to {facts['moved']:.2g}{since}"
+    left_out = ", ".join(
+        f"{count:,} {reason}" for reason, count in facts["left_out"].items() if count
+    )
     return (
         f"{start}: {remaining:,} triangles of {old:,}, {facts['turned']:,} "
-        f"of them turned over; left out {out or 'none'}; {added}; {parts}"
+        f"of them turned over; left out {left_out or 'none'}; {added}; {parts}"
     )
 
 

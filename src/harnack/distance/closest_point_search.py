@@ -826,11 +826,14 @@ class _Query:
         def truncation(y: Vec3) -> tuple[Vec3, Vec3]:
             """Return the exact function minus the approximate one at y: the difference of the
             values (as a vector of equal components), and that of the gradients."""
-            full, sample = exact.evaluator.evaluate(y), approximate.evaluator.evaluate(y)
-            vector = self.backend.Array3f
-            return vector(full.value - sample.value), vector(full.gradient) - vector(
-                sample.gradient
+            at_exact, at_approximate = (
+                exact.evaluator.evaluate(y),
+                approximate.evaluator.evaluate(y),
             )
+            vector = self.backend.Array3f
+            return vector(at_exact.value - at_approximate.value), vector(
+                at_exact.gradient
+            ) - vector(at_approximate.gradient)
 
         def newton(p: Vec3, y: Vec3, value: Vec3, gradient: Vec3) -> tuple[Vec3]:
             """Return the closest point to p, as a tuple of one, by Newton's method from y; NaN if

@@ -174,9 +174,9 @@ def _restore_order(values: Any, order: Any, n: int) -> Any:
     """
     kind = cast("Any", type(values))
     if dr.depth_v(kind) == 1:
-        out = dr.zeros(kind, n)
-        dr.scatter(out, values, order)
-        return out
+        restored = dr.zeros(kind, n)
+        dr.scatter(restored, values, order)
+        return restored
     return kind([_restore_order(component, order, n) for component in values])
 
 

@@ -190,13 +190,13 @@ class Parametrized:
                 )
         make = getattr(type(self), call.maker) if call.maker else type(self)
         # Names that the signature lacks are passed on by the constructor's **kwargs.
-        extra = {
+        further_arguments = {
             name: new_arguments.pop(name)
             for name in [*new_arguments]
             if name not in signature.parameters
         }
         bound = inspect.BoundArguments(signature, cast("Any", new_arguments))
-        return make(*bound.args, **bound.kwargs, **extra)
+        return make(*bound.args, **bound.kwargs, **further_arguments)
 
     def _check_names(self, changes: Mapping[str, Any], arguments: set[str]) -> None:
         """Raise TypeError if a change is none of a parameter, of a part of an argument, or of an

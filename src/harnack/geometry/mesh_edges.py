@@ -215,8 +215,8 @@ def unique_with_inverse(keys: IntArray) -> tuple[IntArray, IntArray, IntArray, I
         ordered = keys[order]
     else:
         # Key and index in one word, since sorting is far faster than `argsort`.
-        both = np.sort((keys << bits) | np.arange(len(keys)))
-        order, ordered = both & ((1 << bits) - 1), both >> bits
+        keys_with_index = np.sort((keys << bits) | np.arange(len(keys)))
+        order, ordered = keys_with_index & ((1 << bits) - 1), keys_with_index >> bits
     is_first = np.ones(len(keys), np.bool_)
     is_first[1:] = ordered[1:] != ordered[:-1]
     index = np.empty(len(keys), np.int64)

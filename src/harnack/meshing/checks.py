@@ -165,11 +165,11 @@ def check_triangle_limit(expected: float, max_triangles: int) -> None:
 def check_inside(vertices: FloatArray, volume: Volume, slack: float) -> None:
     """Raise MeshingError if a vertex (n, 3) lies outside of a volume by more than the length
     `slack`."""
-    out = ~volume.padded(slack).contains_points(vertices)
-    if out.any():
+    is_outside = ~volume.padded(slack).contains_points(vertices)
+    if is_outside.any():
         raise MeshingError(
-            f"{out.sum():,} vertices of the mesh lie outside of what was asked for, such as "
-            f"{point_text(vertices[out][0])}: choose a smaller `cell_size`"
+            f"{is_outside.sum():,} vertices of the mesh lie outside of what was asked for, such as "
+            f"{point_text(vertices[is_outside][0])}: choose a smaller `cell_size`"
         )
 
 

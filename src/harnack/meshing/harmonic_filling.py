@@ -137,8 +137,8 @@ def harmonic_patches(
         raise MeshingError(
             f"{first}; and with triangles in {len(missing):,} holes of three edges: {error}"
         ) from error
-    both = np.concatenate([missing, filling.faces])
-    return dataclasses.replace(filling, faces=both, triangle_fill_count=len(missing))
+    all_new_faces = np.concatenate([missing, filling.faces])
+    return dataclasses.replace(filling, faces=all_new_faces, triangle_fill_count=len(missing))
 
 
 def _fill_all_holes(

@@ -387,7 +387,7 @@ def _mesh_from_signs(
         `is_intersection_free` is set."""
         nonlocal is_intersection_free
         try:
-            triangles, lost, more = mesh_from_signs(
+            triangles, lost, mesh_facts = mesh_from_signs(
                 function(value, side),
                 lattice_box,
                 cell_size,
@@ -399,7 +399,7 @@ def _mesh_from_signs(
             )
         except EmptySurfaceError as error:
             raise EmptySurfaceError(f"{error}{empty_surface_hint(field)}") from error
-        facts.append(more)
+        facts.append(mesh_facts)
         losses.append(lost)
         # The last mesh decides; with two levels this is set to False later.
         is_intersection_free = triangles.is_intersection_free

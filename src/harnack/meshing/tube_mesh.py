@@ -68,20 +68,21 @@ def tube_manifold(tube: Tube, level: float, tolerance: float) -> Manifold:
         _simpler(polyline, _SIMPLIFY * tolerance) for polyline in np.split(tube.points, tube.starts)
     ]
     parts: list[Manifold] = []
-    done = 0
+    # The number of vertices so far.
+    so_far = 0
     while polylines:
         # Rings of a half ball at both ends, and at least one ring at each vertex between.
         minimum = segments * sum(len(polyline) + segments // 2 for polyline in polylines)
-        if done + minimum > _MOST_VERTICES:
+        if so_far + minimum > _MOST_VERTICES:
             raise MeshingError(
-                f"a tube within {tolerance:.3g} has more than {2 * (done + minimum):,} faces: "
+                f"a tube within {tolerance:.3g} has more than {2 * (so_far + minimum):,} faces: "
                 "choose a larger `tolerance`"
             )
         points = polylines.pop()
         swept = _Sweep(radius, segments, points).surface()
         if swept is not None and (len(points) == 2 or _is_apart(swept)):
             parts.append(to_manifold(swept))
-            done += len(swept.vertices)
+            so_far += len(swept.vertices)
         else:
             middle = len(points) // 2
             polylines += [points[: middle + 1], points[middle:]]

@@ -124,10 +124,10 @@ class BalancedTree:
         """Arrange values (n, ...) of the n primitives by the slots of leaves: (leaves, leaf_size,
         ...). Empty slots get the value `empty`."""
         # "clip" reads some value for NO_PRIMITIVE, which is overwritten.
-        out = values.take(self.leaf_slots, axis=0, mode="clip")
+        in_slots = values.take(self.leaf_slots, axis=0, mode="clip")
         leaf, slot = np.nonzero(self.leaf_slots == NO_PRIMITIVE)
-        out[leaf, slot] = empty
-        return out
+        in_slots[leaf, slot] = empty
+        return in_slots
 
 
 def build_balanced_tree(points: FloatArray, *, leaf_size: int = 8, arity: int = 4) -> BalancedTree:
@@ -298,9 +298,9 @@ def pack_tree(
     """
     if tree.node_count >= _MAX_NODES:
         raise ValueError(f"a tree of {tree.node_count} nodes is too large: cut the input in parts")
-    extra = levels[0].shape[1] - _CALLER_NUMBERS
+    payload_size = levels[0].shape[1] - _CALLER_NUMBERS
     heads = np.zeros((tree.node_count, PACKET), backend.dtype)
-    payloads = np.zeros((tree.node_count, extra), backend.dtype)
+    payloads = np.zeros((tree.node_count, payload_size), backend.dtype)
     links = tree.node_links()
     for index, first_child, next_index, values in zip(*links, levels, strict=True):
         heads[index, :_CALLER_NUMBERS] = values[:, :_CALLER_NUMBERS]
@@ -313,7 +313,7 @@ def pack_tree(
     return PackedTree(
         backend,
         RecordTable.upload(backend, heads),
-        RecordTable.upload(backend, payloads) if extra else None,
+        RecordTable.upload(backend, payloads) if payload_size else None,
         dr.opaque(backend.UInt32, tree.node_count),
         RecordTable.upload(backend, primitives.reshape(-1, primitives.shape[2])),
         dr.opaque(backend.UInt32, tree.leaf_size),

@@ -266,7 +266,7 @@ def _cut_up(
     Returns:
         The pieces (j, 3, 3), and the index (j,) of the triangle that each is a piece of.
     """
-    done: list[FloatArray] = []
+    finished_pieces: list[FloatArray] = []
     owners: list[IntArray] = []
     # Pairs of a piece, piece_ids[i], and a knife, knife_ids[i]. triangle_ids: the original triangle
     # of each piece.
@@ -282,10 +282,10 @@ def _cut_up(
         # Pieces that no knife meets are done.
         is_cut = np.zeros(len(pieces), np.bool_)
         is_cut[piece_ids] = True
-        done.append(pieces[~is_cut])
+        finished_pieces.append(pieces[~is_cut])
         owners.append(triangle_ids[~is_cut])
         if not len(piece_ids):
-            return np.concatenate(done), np.concatenate(owners)
+            return np.concatenate(finished_pieces), np.concatenate(owners)
         # Sort pairs by piece; the middle one of each piece cuts it now.
         order = np.argsort(piece_ids, kind="stable")
         piece_ids, knife_ids, height = piece_ids[order], knife_ids[order], height[order]

@@ -97,8 +97,8 @@ class AxialBound:
 def _horner(terms: list[tuple[int, Real]], x: Real) -> Real:
     """The polynomial that is the sum of c x^i over the terms (i, c), at x, by Horner's rule. The
     powers i decrease from term to term."""
-    (i, total), *rest = terms
-    for j, c in rest:
+    (i, total), *lower_terms = terms
+    for j, c in lower_terms:
         total, i = total * _power(x, i - j) + c, j
     return total * _power(x, i) if i else total
 
