@@ -308,6 +308,7 @@ def _level_along(
         low, high = (np.take_along_axis(t, first_change + k, axis=1)[:, 0] for k in (0, 1))
     crossing = start + low[:, None] * along
     crossing = crossing if walls is None else np.clip(crossing, *walls)
+    # Newton's steps are at most four of the last intervals long.
     max_step = 4 * (high - low) * row_norms(along)
     return newton_to_level(function, crossing, function.sample(crossing), max_step, walls), is_found
 
@@ -498,6 +499,7 @@ def improve(
         vertices = smooth(function, vertices, faces, walls, rounds=2)
     is_boundary_vertex = np.zeros(len(vertices), np.bool_)
     is_boundary_vertex[boundary_edges(faces)] = True
+    # Twice the tolerance, as the mesh is refined afterwards.
     faces = collapse_slivers(function, vertices, faces, is_boundary_vertex, 2 * tolerance)
     vertices, faces = refine(function, vertices, faces, tolerance, walls, report)
     for _ in range(2):
@@ -576,6 +578,7 @@ def smooth_within_tolerance(
         tolerance; None for all."""
     after = smooth(function, vertices, faces, walls)
     rows = np.arange(len(faces))
+    # At most eight rounds, each with more vertices at their former positions.
     for _ in range(8):
         marks = _RefinementMarks.of(function, after, faces[rows], tolerance, walls, where)
         is_off = np.zeros(len(faces), np.bool_)
@@ -600,6 +603,7 @@ def _undo_flipped(before: FloatArray, after: FloatArray, faces: IntArray) -> Flo
 
     Undoing a move at some vertices may turn other faces over, so this is repeated. If it does not
     come to an end, all vertices get their positions in `before`."""
+    # At most eight rounds.
     for _ in range(8):
         new_corner = after[faces]
         new_normal = area_normals(new_corner)

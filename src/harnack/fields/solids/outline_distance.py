@@ -214,6 +214,7 @@ class OutlineEdges:
         # A distance within which some chain must have a point, so that the nearest edge is not
         # farther away.
         (square,) = chains.for_each(query.chain_upper_bound, (query.x + dr.inf,), "outline chains")
+        # (1e-5 covers the rounding of the root.)
         max_distance = dr.sqrt(square) * (1 + 1e-5) + query.error
         index = type(chains.iteration_count)(0)
 
@@ -461,4 +462,5 @@ class SignedDistanceEnclosure(Enclosure):
         length = self.size.free_length(LevelGaps(fmin(nearer, dr.abs(self.value)), farther))
         # NaN proves nothing. The Lipschitz constant 1 proves the smaller gap.
         is_valid = (gaps.below >= 0) & (gaps.above >= 0)
+        # (1e-6 covers the rounding of the gap.)
         return dr.select(is_valid, fmax(length, fmin(gaps.below, gaps.above) * (1 - 1e-6)), 0)
