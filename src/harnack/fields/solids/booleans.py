@@ -27,7 +27,7 @@ from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, Negate
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import on_backend, probe_jets
+from harnack.fields.formula import on_backend, own_formula, probe_jets
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
     FormulaSolid,
@@ -164,7 +164,9 @@ class BooleanSolid(Solid):
         return _box_around_volumes(bounded)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return _extremum([part.formula(x, y, z) for part in self.parts], is_union=self.is_union)
+        return _extremum(
+            [own_formula(part)(x, y, z) for part in self.parts], is_union=self.is_union
+        )
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> BooleanSolidEvaluator:
         parts = tuple(part.evaluator(backend, plan) for part in self.parts)
@@ -463,7 +465,7 @@ class Complement(SolidOfField):
         return self.field.sublevel_extent(-level, above=not above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return -self.field.formula(x, y, z)
+        return -own_formula(self.field)(x, y, z)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         return _ComplementEvaluator(self.field.evaluator(backend, without_levels(plan)))
@@ -534,7 +536,7 @@ class OffsetSolid(SolidOfField):
         return self.field.sublevel_extent(level + self.distance, above=above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.field.formula(x, y, z) - self.distance
+        return own_formula(self.field)(x, y, z) - self.distance
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         inner = self.field.evaluator(backend, without_levels(plan))
@@ -616,7 +618,7 @@ class BlendedSolid(FormulaSolid):
         for part in self.parts:
             if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(part))
-            part.formula(*probe_jets())  # raises TypeError for a solid without a formula
+            own_formula(part)(*probe_jets())  # raises TypeError for a solid without a formula
         constants = [part.lipschitz for part in self.parts]
         all_known = all(part is not None for part in constants)
         # The constant of the blend of two functions, with a margin for rounding.
@@ -662,6 +664,6 @@ class BlendedSolid(FormulaSolid):
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a, b = (part.formula(x, y, z) for part in self.parts)
+        a, b = (own_formula(part)(x, y, z) for part in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)
