@@ -22,6 +22,7 @@ from harnack.fields import Field, Sample
 from harnack.geometry import example_curves
 from harnack.testing import BrokenPromiseError, check_field
 
+P = np.array([[0.5, 0.0, 0.0]])
 RAY = (np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
 
 
@@ -380,6 +381,52 @@ def test_no_formula_of_another_function_is_taken(make: Callable[[], hk.Field]) -
         TypeError, match=r"define formula\(x, y, z\) of the same function in Larger"
     ):
         make()
+
+
+class Twice(hk.Field):
+    """A field whose two methods disagree."""
+
+    domain = hk.Ball(radius=2.0)
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(dr.norm(p) - 1, dr.normalize(p), (Lipschitz(1.0),))
+
+    def evaluator(self, backend: Any, plan: Any) -> Any:
+        return hk.fields.EvaluateOnly(
+            lambda p: Sample(dr.norm(p) - 0.5, dr.normalize(p), (Lipschitz(1.0),))
+        )
+
+
+def test_methods_that_disagree_are_found() -> None:
+    with pytest.raises(BrokenPromiseError, match=r"Field.evaluate is not the value of the eval"):
+        check_field(Twice())
+    assert Twice().value([0.0, 0.0, 2.0]) == 1.5  # without a plan
+
+
+def returning(evaluator: Any) -> hk.Field:
+    """A field of a class with this method, and with nothing else."""
+    return type("Own", (hk.Field,), {"evaluator": evaluator, "domain": hk.Ball(radius=2.0)})()
+
+
+@pytest.mark.parametrize("use", [lambda field: hk.trace(field, *RAY), lambda field: field.value(P)])
+@pytest.mark.parametrize(
+    ("evaluator", "message"),
+    [
+        (lambda self, backend: None, r"Own.evaluator: .*write def evaluator\(self, backend, plan"),
+        (lambda self, backend, plan: None, "Own.evaluator returned nothing: return a"),
+        (lambda self, backend, plan: self, "Own.evaluator returned an object of type Own"),
+        (lambda self, backend, plan: hk.fields.SampleEvaluator(self, backend), "Own does not def"),
+    ],
+)
+def test_what_evaluator_must_return_is_said(evaluator: Any, message: str, use: Any) -> None:
+    with pytest.raises(TypeError, match=message):
+        use(returning(evaluator))
+
+
+def test_traits_of_another_type_are_refused() -> None:
+    kind = type("Own", (Twice,), {"traits": {"has_jumps": True}})
+    with pytest.raises(TypeError, match=r"the traits of Own are .*harnack.fields.Traits\("):
+        kind()
 
 
 class Rounded(Field):

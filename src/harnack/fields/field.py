@@ -34,7 +34,14 @@ from harnack.backend.validation import (
 )
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
-from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, validate_samples
+from harnack.enclosures.samples import (
+    Ray,
+    RaySample,
+    Sample,
+    describe_type,
+    space_scaled,
+    validate_samples,
+)
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.parameters import Parametrized, differentiable_parameters, record_call
@@ -154,10 +161,16 @@ class Field(Parametrized, abc.ABC):
         Raises:
             NotImplementedError: arguments with derivatives enabled, which would be lost because the
                 traits of the class do not say `has_parameter_derivatives`.
-            TypeError: the class defines neither `evaluate` nor `evaluator`; or an argument `domain`
-                that is neither a volume nor None.
+            TypeError: the class defines neither `evaluate` nor `evaluator`; its traits are no
+                `Traits`; or an argument `domain` that is neither a volume nor None.
         """
-        if not cls.traits.has_parameter_derivatives:
+        traits: Any = cls.traits
+        if not isinstance(traits, Traits):
+            raise TypeError(
+                f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
+                "harnack.fields.Traits(...), such as Traits(has_creases=True)"
+            )
+        if not traits.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
@@ -184,6 +197,8 @@ class Field(Parametrized, abc.ABC):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
                 setattr(cls, name, classmethod(checked_maker))
         defines_evaluator = "evaluator" in vars(cls)
+        if defines_evaluator and not cls.__module__.startswith("harnack."):
+            cls.evaluator = cast("Any", _checked_evaluator(cls.evaluator))
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
@@ -392,6 +407,34 @@ def _attributes(field: Field) -> dict[str, Any]:
     return vars(field) | {name: getattr(field, name) for name in slots if hasattr(field, name)}
 
 
+def _checked_evaluator(
+    evaluator: Callable[[Any, Backend, Plan], Evaluator],
+) -> Callable[[Any, Backend, Plan], Evaluator]:
+    """The method `evaluator` of a user's class, which raises a TypeError if it does not take a
+    backend and a plan, or returns no evaluator. The plan may be left out of calls."""
+
+    @functools.wraps(evaluator)
+    def checked(self: Any, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator, after the checks."""
+        name = type(self).__name__
+        try:
+            inspect.signature(evaluator).bind(self, backend, plan)
+        except TypeError as error:
+            raise TypeError(
+                f"{name}.evaluator: {error}: write def evaluator(self, backend, plan=None)"
+            ) from None
+        result: Any = evaluator(self, backend, plan)
+        if not isinstance(result, Evaluator):
+            raise TypeError(
+                f"{name}.evaluator returned {describe_type(result)}: return a "
+                "harnack.fields.Evaluator; one that calls the evaluate(p) of the field is "
+                "harnack.fields.SampleEvaluator(self, backend)"
+            )
+        return result
+
+    return checked
+
+
 def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[Any, Vec3], Sample]:
     """The method `evaluate` of a class of fields that defines `evaluator`."""
 
@@ -470,6 +513,11 @@ class SampleEvaluator(Evaluator):
         variable_accuracy: VariableAccuracy | None = None,
         is_steep: bool = False,
     ) -> None:
+        if _stating_class(type(field)) is Field:
+            raise TypeError(
+                f"a SampleEvaluator calls the evaluate(p) of the field, and {type(field).__name__} "
+                "does not define it"
+            )
         ready = _with_ready_fields(field, backend)
         self.field = _with_inherited_evaluator(ready, field, backend)
         self._evaluate = vars(_stating_class(type(field)))["evaluate"]

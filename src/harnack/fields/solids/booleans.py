@@ -8,6 +8,7 @@ it."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import numbers
@@ -20,6 +21,8 @@ import numpy as np
 
 from harnack.arithmetic import maximum, minimum
 from harnack.arithmetic.norms import blend_intersection, blend_union
+from harnack.arithmetic.operators import Tally, tally_of
+from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite
 from harnack.enclosures import Enclosure, Lipschitz
@@ -662,6 +665,15 @@ class BlendedSolid(FormulaSolid):
         if level >= self.radius:
             return level
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
+
+    @property
+    def tally(self) -> Tally:
+        """The summary of the formula's operations, for an unknown radius. The formula divides by
+        the radius and multiplies by it again. So a small one makes no slope steep, and must not
+        count as a number by which f may turn sharply."""
+        other = copy.copy(self)
+        object.__setattr__(other, "radius", choose_backend("double").Float(self.radius))
+        return tally_of(other.formula)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b = (own_formula(part)(x, y, z) for part in self.parts)
