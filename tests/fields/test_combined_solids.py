@@ -434,3 +434,11 @@ def test_a_ray_through_a_crease_is_a_hit_where_its_gradients_say_how_near_the_su
     o = foot + 3e-6 * rng.normal(size=(5000, 3)) - 2.148 * d
     found = hk.trace(carved, o, d, tolerance=2e-4)
     assert found.is_hit.all()
+
+
+def test_the_radius_of_a_blend_is_a_number_of_the_kernel_only() -> None:
+    """A blend of a small radius counted as steep: another kernel, with more samples."""
+    backend = choose_backend("single")
+    for radius in (0.5, 0.05):
+        blend = hk.Sphere(0.5).blended(hk.Cuboid((1.0, 0.2, 0.2)), radius)
+        assert not blend.evaluator(backend).is_steep

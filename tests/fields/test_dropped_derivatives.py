@@ -320,3 +320,77 @@ def test_the_check_of_a_mesh_refuses_vertices_with_derivatives() -> None:
     vertices = [[x, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     with pytest.raises(NotImplementedError, match="the vertices cannot be differentiated"):
         geometry.validate_mesh(vertices, [[0, 1, 2]])
+
+
+class Around(hk.Field):
+    """A field of a user that is another field."""
+
+    traits = hk.fields.Traits(has_parameter_derivatives=True)
+    period = hk.SolidAngle.period
+
+    def __init__(self, inner: Any) -> None:
+        self.inner = inner
+
+    def evaluate(self, p: Any) -> Any:
+        return self.inner.evaluate(p)
+
+
+def test_a_field_that_holds_a_curve_has_derivatives_by_its_vertices() -> None:
+    """They were dropped without a word."""
+    derivatives: list[Any] = []
+    p = DOUBLE.Array3f(0.1, 0.2, 0.5)
+    for wrap in (lambda curve: curve, Around, lambda curve: Around(Around(curve))):
+        vertices = DOUBLE.Array3f(LOOP.T)
+        dr.enable_grad(vertices)
+        dr.backward(wrap(hk.SolidAngle(vertices)).value(p))
+        derivatives.append(np.array(vertices.grad))
+    assert np.abs(derivatives[0]).max() > 1e-3
+    np.testing.assert_allclose(derivatives[1], derivatives[0], rtol=1e-12)
+    np.testing.assert_allclose(derivatives[2], derivatives[0], rtol=1e-12)
+
+
+class _Ball(hk.fields.Evaluator):
+    """|p| - radius."""
+
+    def __init__(self, radius: Any) -> None:
+        self.radius = radius
+
+    def evaluate(self, p: Any) -> hk.fields.Sample:
+        value = dr.norm(p) - self.radius
+        return hk.fields.Sample(value, dr.normalize(p), (hk.proofs.Lipschitz(1.0),))
+
+
+class OwnBall(hk.Field):
+    """|p| - radius, by an evaluator of a user that does not define `differentiable_value`."""
+
+    traits = hk.fields.Traits(has_parameter_derivatives=True)
+
+    def __init__(self, radius: Any) -> None:
+        self.radius = radius
+
+    def evaluator(self, backend: Any, plan: Any = None) -> _Ball:
+        return _Ball(self.radius)
+
+
+def test_the_parameters_of_an_evaluator_have_derivatives() -> None:
+    """They were dropped without a word, beside those by points."""
+    p, radius = DOUBLE.Array3f(0.0, 0.6, 0.8), DOUBLE.Float(0.5)
+    dr.enable_grad(p, radius)
+    dr.backward(OwnBall(radius).value(p))
+    assert radius.grad == -1.0
+    np.testing.assert_allclose(np.array(p.grad).ravel(), [0.0, 0.6, 0.8])
+
+
+def test_hits_of_a_function_that_hides_a_number_are_refused() -> None:
+    """The derivative was dropped without a word, as no attribute of the field holds the number."""
+    radius = DOUBLE.Float(0.5)
+    dr.enable_grad(radius)
+
+    class Hiding(hk.Field):
+        def evaluate(self, p: Any) -> Any:
+            return _Ball(radius).evaluate(p)
+
+    with pytest.raises(NotImplementedError, match="Hiding cannot be differentiated by these"):
+        hk.trace(Hiding(), DOUBLE.Array3f(0.0, 0.0, 2.0), DOUBLE.Array3f(0.0, 0.0, -1.0))
+    with pytest.raises(NotImplementedError, match="solid cannot be differentiated by these"):
+        hk.solid(Hiding(), below=0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable
@@ -19,6 +22,7 @@ from harnack.fields import Field, Sample
 from harnack.geometry import example_curves
 from harnack.testing import BrokenPromiseError, check_field
 
+P = np.array([[0.5, 0.0, 0.0]])
 RAY = (np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
 
 
@@ -270,6 +274,159 @@ def test_a_field_that_holds_a_field_of_the_library_is_prepared_with_it() -> None
     np.testing.assert_array_equal(hits.status, expected.status)
     assert hits.is_hit.sum() > 50
     np.testing.assert_allclose(hits.t[hits.is_hit], expected.t[hits.is_hit], atol=1e-3)
+
+
+class InContainers(Wrapped):
+    """The same, from a field in a record in a dictionary, which no other attribute holds."""
+
+    def __init__(self, inner: hk.Field) -> None:
+        self.default_level = inner.default_level
+        self.records = {"first": (Record(inner),)}
+
+    def evaluate(self, p: Any) -> Any:
+        return self.records["first"][0].field.evaluate(p)
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    field: Any
+
+
+def test_fields_in_dictionaries_and_records_are_prepared() -> None:
+    """The process ended."""
+    angle = hk.SolidAngle(example_curves.wavy_polygon(12))
+    o, d = [[0.3, 0.1, 2.5]], [[-0.1, 0.0, -1.0]]
+    expected = hk.trace(angle, o, d, t_max=10.0, tolerance=1e-4).t
+    again = hk.SolidAngle(example_curves.wavy_polygon(12))  # nothing of it is kept
+    t = hk.trace(InContainers(again), o, d, t_max=10.0, tolerance=1e-4).t
+    np.testing.assert_allclose(t, expected, atol=1e-3)
+
+
+def test_a_field_that_nothing_prepared_is_refused_by_name() -> None:
+    """The process ended."""
+    hidden = hk.SolidAngle(example_curves.wavy_polygon(12))
+
+    class Own(hk.Field):
+        period = 4 * math.pi
+
+        def evaluate(self, p: Any) -> Any:
+            return hidden.evaluate(p)
+
+    with pytest.raises(RuntimeError, match="a SolidAngle cannot be uploaded while a kernel is"):
+        hk.trace(hk.Surface(Own(), 2 * math.pi), [[0.3, 0.1, 2.5]], [[0.0, 0.0, -1.0]])
+
+
+def test_slots_are_copied_and_pickled() -> None:
+    class Own(hk.Field):
+        __slots__ = ("radius",)
+
+        def evaluate(self, p: Any) -> Sample:
+            return Sample(dr.norm(p) - self.radius, dr.normalize(p), (Lipschitz(1.0),))
+
+    own = Own()
+    own.radius = 0.5
+    assert copy.copy(own).radius == copy.deepcopy(own).radius == 0.5
+
+
+def doubled(sample: Sample) -> Sample:
+    """The sample of 2 f; the promises are left out, as nothing is traced."""
+    return Sample(2 * sample.value, 2 * sample.gradient, (Lipschitz(1e3),))
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        (hk.DipolePotential, (np.eye(3), np.eye(3))),
+        (hk.SolidAngle, (np.eye(3),)),
+        (functools.partial(hk.SolidAngle, cells=True), (example_curves.wavy_polygon(300),)),
+    ],
+)
+def test_values_are_those_of_an_overridden_evaluate(kind: Any, arguments: Any) -> None:
+    """They were those of the base class, without the factor 2."""
+    base = getattr(kind, "func", kind)
+
+    class Own(base):
+        def evaluate(self, p: Any) -> Any:
+            return doubled(super().evaluate(p))
+
+    options = getattr(kind, "keywords", {})
+    own, field = Own(*arguments, **options), kind(*arguments)
+    points = np.array([[0.3, 0.2, 0.5], [0.7, -0.4, 0.3]])
+    for name in ("value", "gradient"):
+        expected = 2 * getattr(field, name)(points)
+        np.testing.assert_allclose(getattr(own, name)(points), expected, rtol=1e-2)
+    with pytest.raises(NotImplementedError, match="define its method hessian"):
+        own.hessian(points)
+
+
+class Larger(hk.Sphere):
+    """A sphere whose radius is 0.2 larger, with the formula of the smaller one."""
+
+    def evaluate(self, p: Any) -> Sample:
+        sample = super().evaluate(p)
+        return Sample(sample.value - 0.2, sample.gradient, (Lipschitz(1.0),))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Larger(0.6).blended(hk.Cuboid((1.0, 0.1, 0.1)), 0.1),
+        lambda: (Larger(0.6) | hk.Cuboid((1.0, 0.1, 0.1))).twisted(40.0),
+        lambda: hk.solids.DisplacedSolid(Larger(0.6), hk.solids.Noise()),
+    ],
+)
+def test_no_formula_of_another_function_is_taken(make: Callable[[], hk.Field]) -> None:
+    """The blend was that of the smaller sphere."""
+    with pytest.raises(
+        TypeError, match=r"define formula\(x, y, z\) of the same function in Larger"
+    ):
+        make()
+
+
+class Twice(hk.Field):
+    """A field whose two methods disagree."""
+
+    domain = hk.Ball(radius=2.0)
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(dr.norm(p) - 1, dr.normalize(p), (Lipschitz(1.0),))
+
+    def evaluator(self, backend: Any, plan: Any) -> Any:
+        return hk.fields.EvaluateOnly(
+            lambda p: Sample(dr.norm(p) - 0.5, dr.normalize(p), (Lipschitz(1.0),))
+        )
+
+
+def test_methods_that_disagree_are_found() -> None:
+    with pytest.raises(BrokenPromiseError, match=r"Field.evaluate is not the value of the eval"):
+        check_field(Twice())
+    assert Twice().value([0.0, 0.0, 2.0]) == 1.5  # without a plan
+
+
+def returning(evaluator: Any) -> hk.Field:
+    """A field of a class with this method, and with nothing else."""
+    return type("Own", (hk.Field,), {"evaluator": evaluator, "domain": hk.Ball(radius=2.0)})()
+
+
+@pytest.mark.parametrize("use", [lambda field: hk.trace(field, *RAY), lambda field: field.value(P)])
+@pytest.mark.parametrize(
+    ("evaluator", "message"),
+    [
+        (lambda self, backend: None, r"Own.evaluator: .*write def evaluator\(self, backend, plan"),
+        (lambda self, backend, plan: None, "Own.evaluator returned nothing: return a"),
+        (lambda self, backend, plan: self, "Own.evaluator returned an object of type Own"),
+        (lambda self, backend, plan: hk.fields.SampleEvaluator(self, backend), "Own does not def"),
+    ],
+)
+def test_what_evaluator_must_return_is_said(evaluator: Any, message: str, use: Any) -> None:
+    with pytest.raises(TypeError, match=message):
+        use(returning(evaluator))
+
+
+def test_traits_of_another_type_are_refused() -> None:
+    kind = type("Own", (Twice,), {"traits": {"has_jumps": True}})
+    with pytest.raises(TypeError, match=r"the traits of Own are .*harnack.fields.Traits\("):
+        kind()
 
 
 class Rounded(Field):

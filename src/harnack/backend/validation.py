@@ -280,8 +280,14 @@ def _contained_values(value: Any) -> list[Any]:
     if inspect.ismethod(value):
         return [value.__func__, value.__self__]
     # Of other objects, only dataclasses, callables and fields (with `parameters`) are searched.
-    is_known = dataclasses.is_dataclass(value) or callable(value) or hasattr(value, "parameters")
-    return [*getattr(value, "__dict__", {}).values()] if is_known else []
+    is_field = hasattr(value, "parameters")
+    if not (dataclasses.is_dataclass(value) or callable(value) or is_field):
+        return []
+    attributes = [*getattr(value, "__dict__", {}).values()]
+    # The function of a field of a user's class may use numbers from outside, too.
+    if is_field and not type(value).__module__.startswith("harnack."):
+        attributes.append(getattr(cast("Any", type(value)), "evaluate", None))
+    return attributes
 
 
 def format_short(value: Any) -> str:

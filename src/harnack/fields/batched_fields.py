@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar, cast
@@ -21,12 +22,14 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.elementary import fmax
 from harnack.backend.tensors import accepts_tensors
 from harnack.cluster.dask_arrays import accepts_dask_arrays
+from harnack.enclosures.samples import value_error_bound
 from harnack.fields.batch_evaluation import evaluate_points
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, SampleEvaluator, Traits
 from harnack.fields.parameters import differentiable_parameters
 from harnack.fmm.point_values import PointValues, SymmetricMatrix
+from harnack.name_suggestions import with_article
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
@@ -42,11 +45,20 @@ class BatchedField(Field):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Let `evaluator` of a new subclass that defines `evaluate` and not `evaluator` return an
-        object with the derivatives of `values_at`."""
+        object with the derivatives of `values_at`. If the subclass defines `evaluate` and not
+        `values_at`, it gets one that calls `evaluate`: that of a base class is of another
+        function."""
+        defines_evaluate = "evaluate" in vars(cls)
         defines_evaluator = "evaluator" in vars(cls)
         super().__init_subclass__(**kwargs)
-        if "evaluate" in vars(cls) and not defines_evaluator:
+        if not defines_evaluate:
+            return
+        if not defines_evaluator:
             cls.evaluator = _evaluator_of_users_class
+        if "values_at" not in vars(cls):
+            cls.values_at = _values_of_samples
+            if "sharp_values_at" not in vars(cls):
+                cls.sharp_values_at = BatchedField.sharp_values_at
 
     @abc.abstractmethod
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
@@ -222,6 +234,33 @@ def _evaluator_of_users_class(
     return _EvaluatorOfUsersClass(self, backend)
 
 
+def _values_of_samples(
+    self: BatchedField, x: Vec3, derivatives: int, closer: Real = 1.0
+) -> PointValues:
+    """The method `values_at` of a `BatchedField` whose class defines `evaluate` and not
+    `values_at`. Second derivatives are those of the class's `hessian`, with an unknown error.
+
+    Raises:
+        NotImplementedError: the class does not define `hessian`.
+    """
+    del closer
+    sample = self.evaluator(backend_of(x)).evaluate(x)
+    hessian = None
+    if derivatives == 2:
+        if type(self).hessian is BatchedField.hessian:
+            raise NotImplementedError(
+                f"{type(self).__name__} gives no second derivatives: define its method "
+                "hessian(p), or ask for what needs none, such as signed_distance(..., "
+                'method="first_order")'
+            )
+        first, second, third = self.hessian(x)
+        hessian = SymmetricMatrix(first.x, second.y, third.z, first.y, first.z, second.z)
+    error = value_error_bound(sample, 0 * x.x, 0 * x.x)  # without the rounding of x
+    return PointValues(
+        sample.value, error, sample.gradient, hessian, sample.gradient_error, math.inf
+    )
+
+
 class SumData(Protocol):
     """A sum over sources on a backend, which is sampled at any accuracy. The accuracy scale says
     how accurately: larger is more accurate (`VariableAccuracy`)."""
@@ -392,6 +431,9 @@ def cached_upload(upload: Upload) -> Upload:
 
     A field with parameters is uploaded at each call: a parameter may change in place, and its
     derivatives belong to a single trace.
+
+    The decorated method raises a RuntimeError if it would have to upload while a loop is recorded,
+    when Dr.Jit might end the process.
     """
     # For each field the data by backend and arguments, in the order of their last use.
     cache: FieldCache[dict[Any, Any]] = FieldCache()
@@ -400,11 +442,13 @@ def cached_upload(upload: Upload) -> Upload:
     def cached(self: Field, backend: Backend, *arguments: Any, **settings: Any) -> Any:
         """The data: the cached ones, unless the field has parameters."""
         if differentiable_parameters(self):
+            _refuse_while_recording(self)
             return upload(self, backend, *arguments, **settings)
         uploads = cache.get(self, None, dict)
         key = backend, arguments, tuple(sorted(settings.items()))
         data = uploads.pop(key, _NOT_UPLOADED)
         if data is _NOT_UPLOADED:
+            _refuse_while_recording(self)
             data = upload(self, backend, *arguments, **settings)
         uploads[key] = data
         while len(uploads) > _MAX_UPLOADS:
@@ -413,6 +457,18 @@ def cached_upload(upload: Upload) -> Upload:
 
     cast("Any", cached).is_cached_upload = True  # `keeps_uploads` asks for it
     return cast("Upload", cached)
+
+
+def _refuse_while_recording(field: Field) -> None:
+    """Raise RuntimeError if Dr.Jit records a loop, because then nothing can be uploaded."""
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        name = type(field).__name__
+        raise RuntimeError(
+            f"the data of {with_article(name)} cannot be uploaded while a kernel is recorded: let "
+            "the field that uses it hold it as an attribute, or in an attribute that is a list, "
+            "tuple, dictionary or dataclass, and call evaluate(p) of it; or, in a loop of your "
+            "own, call that of evaluator = field.evaluator(backend), made before the loop"
+        )
 
 
 def keeps_uploads(field: Field) -> bool:

@@ -150,19 +150,19 @@ class Evaluator(abc.ABC):
         parameters.
 
         With respect to p it can be differentiated once: its derivative is the gradient of the
-        sample. So no derivative passes through `evaluate`, which may run a recorded loop. This
+        sample. So no derivative by p passes through `evaluate`, which may run a recorded loop. This
         holds at ties of a formula, too (points where the two arguments of a maximum or minimum are
-        equal). An evaluator of a field with parameters overrides this method.
+        equal). Derivatives by parameters pass through `evaluate`; an evaluator of a field with
+        parameters overrides this method if that runs a loop.
         """
         at = dr.detach(p)
-        with dr.suspend_grad():
-            sample = self.evaluate(at)
+        sample = self.evaluate(at)
         # Dr.Jit would drop a gradient that is the literal 0, and with it the dependence on p. A
         # kernel parameter is no literal.
-        gradient = as_kernel_parameters(sample.gradient)
+        gradient = as_kernel_parameters(dr.detach(sample.gradient))
         # The value of the first argument with the derivative of the second one. `at` is p without
         # derivatives, so p - at is 0 and has the derivative 1.
-        return dr.replace_grad(sample.value, dr.dot(gradient, p - at))
+        return dr.replace_grad(sample.value, sample.value + dr.dot(gradient, p - at))
 
 
 class EvaluateOnly(Evaluator):

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import abc
 import copy
+import copyreg
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
@@ -32,7 +34,14 @@ from harnack.backend.validation import (
 )
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import BoundedLaplacian, HarmonicBall, Lipschitz, TaylorRemainder
-from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled, validate_samples
+from harnack.enclosures.samples import (
+    Ray,
+    RaySample,
+    Sample,
+    describe_type,
+    space_scaled,
+    validate_samples,
+)
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.parameters import Parametrized, differentiable_parameters, record_call
@@ -152,10 +161,16 @@ class Field(Parametrized, abc.ABC):
         Raises:
             NotImplementedError: arguments with derivatives enabled, which would be lost because the
                 traits of the class do not say `has_parameter_derivatives`.
-            TypeError: the class defines neither `evaluate` nor `evaluator`; or an argument `domain`
-                that is neither a volume nor None.
+            TypeError: the class defines neither `evaluate` nor `evaluator`; its traits are no
+                `Traits`; or an argument `domain` that is neither a volume nor None.
         """
-        if not cls.traits.has_parameter_derivatives:
+        traits: Any = cls.traits
+        if not isinstance(traits, Traits):
+            raise TypeError(
+                f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
+                "harnack.fields.Traits(...), such as Traits(has_creases=True)"
+            )
+        if not traits.has_parameter_derivatives:
             check_no_derivatives(cls.__name__, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
@@ -182,6 +197,8 @@ class Field(Parametrized, abc.ABC):
                 checked_maker = no_derivatives(cast("Any", attribute).__func__)
                 setattr(cls, name, classmethod(checked_maker))
         defines_evaluator = "evaluator" in vars(cls)
+        if defines_evaluator and not cls.__module__.startswith("harnack."):
+            cls.evaluator = cast("Any", _checked_evaluator(cls.evaluator))
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
@@ -199,15 +216,21 @@ class Field(Parametrized, abc.ABC):
 
     def __copy__(self) -> Self:
         other = object.__new__(type(self))
-        vars(other).update(vars(self))
+        for name, value in _attributes(self).items():
+            object.__setattr__(other, name, value)  # also of frozen dataclasses, and in __slots__
         return other
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Any) -> None:
         """Restore a pickled field or a deep copy from its attributes `state`, and make its arrays
         read-only again, because NumPy does not pickle this. (They are read-only because results
-        were computed from them already: writing to an array would not update these.)"""
-        vars(self).update(state)
-        make_read_only(state)
+        were computed from them already: writing to an array would not update these.) Of a class
+        with `__slots__` the state is a pair: the attributes, and those in the slots."""
+        attributes: dict[str, Any] = {}
+        for record in cast("tuple[Any, ...]", state if isinstance(state, tuple) else (state,)):
+            attributes |= record or {}
+        for name, value in attributes.items():
+            object.__setattr__(self, name, value)
+        make_read_only(attributes)
 
     def __repr__(self) -> str:
         """The constructor call as text, with those arguments that the field still stores as
@@ -378,6 +401,40 @@ class Field(Parametrized, abc.ABC):
         return {}
 
 
+def _attributes(field: Field) -> dict[str, Any]:
+    """The attributes of a field by name, with those in `__slots__` of its class."""
+    slots: list[str] = cast("Any", copyreg)._slotnames(type(field))  # pickle takes these
+    return vars(field) | {name: getattr(field, name) for name in slots if hasattr(field, name)}
+
+
+def _checked_evaluator(
+    evaluator: Callable[[Any, Backend, Plan], Evaluator],
+) -> Callable[[Any, Backend, Plan], Evaluator]:
+    """The method `evaluator` of a user's class, which raises a TypeError if it does not take a
+    backend and a plan, or returns no evaluator. The plan may be left out of calls."""
+
+    @functools.wraps(evaluator)
+    def checked(self: Any, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        """The evaluator, after the checks."""
+        name = type(self).__name__
+        try:
+            inspect.signature(evaluator).bind(self, backend, plan)
+        except TypeError as error:
+            raise TypeError(
+                f"{name}.evaluator: {error}: write def evaluator(self, backend, plan=None)"
+            ) from None
+        result: Any = evaluator(self, backend, plan)
+        if not isinstance(result, Evaluator):
+            raise TypeError(
+                f"{name}.evaluator returned {describe_type(result)}: return a "
+                "harnack.fields.Evaluator; one that calls the evaluate(p) of the field is "
+                "harnack.fields.SampleEvaluator(self, backend)"
+            )
+        return result
+
+    return checked
+
+
 def _evaluate_by(evaluator: Callable[[Any, Backend], Evaluator]) -> Callable[[Any, Vec3], Sample]:
     """The method `evaluate` of a class of fields that defines `evaluator`."""
 
@@ -434,8 +491,8 @@ def _stating_class(kind: type[Field]) -> type[Field]:
 
 class SampleEvaluator(Evaluator):
     """The evaluator of a field whose class defines `evaluate`. Fields that are attributes of the
-    field, or entries of attributes that are lists or tuples, are made ready for the backend, too:
-    within `evaluate`, self.inner.evaluate(p) uses data on the backend.
+    field, or are in attributes that are lists, tuples, dictionaries or dataclasses, are made ready
+    for the backend, too: within `evaluate`, self.inner.evaluate(p) uses data on the backend.
 
     field: the field. The attribute `field` is a copy of it if fields are among its attributes.
     backend: the backend.
@@ -456,11 +513,21 @@ class SampleEvaluator(Evaluator):
         variable_accuracy: VariableAccuracy | None = None,
         is_steep: bool = False,
     ) -> None:
+        if _stating_class(type(field)) is Field:
+            raise TypeError(
+                f"a SampleEvaluator calls the evaluate(p) of the field, and {type(field).__name__} "
+                "does not define it"
+            )
         ready = _with_ready_fields(field, backend)
         self.field = _with_inherited_evaluator(ready, field, backend)
         self._evaluate = vars(_stating_class(type(field)))["evaluate"]
         self.jumps, self.modulo_one, self.patches = jumps, modulo_one, patches
         self.variable_accuracy, self.is_steep = variable_accuracy, is_steep
+
+    @property
+    def name(self) -> str:
+        """The name of the field's class, for messages."""
+        return type(self.field).__name__
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._evaluate(self.field, p)
@@ -498,8 +565,10 @@ def refuse_hidden_parameters(field: Field) -> None:
 
 def _with_ready_fields(field: Field, backend: Backend) -> Field:
     """The field, or a copy of it in which each field among its attributes is `_ready`."""
-    ready = {name: _ready_in(value, backend) for name, value in vars(field).items()}
-    if all(value is vars(field)[name] for name, value in ready.items()):
+    attributes = _attributes(field)
+    attributes.pop("_constructor_call", None)  # `evaluate` does not use it
+    ready = {name: _ready_in(value, backend) for name, value in attributes.items()}
+    if all(value is attributes[name] for name, value in ready.items()):
         return field
     other = copy.copy(field)
     for name, value in ready.items():
@@ -507,21 +576,68 @@ def _with_ready_fields(field: Field, backend: Backend) -> Field:
     return other
 
 
-def _ready_in(value: Any, backend: Backend) -> Any:
+def _ready_in(value: Any, backend: Backend, outer: tuple[Any, ...] = ()) -> Any:
     """The value of a field's attribute, where each field in it is `_ready`. Fields are found if
-    they are the value itself or entries of a list or tuple. If there are none, the same object is
-    returned."""
+    they are the value itself, or are in a list, tuple, dictionary or dataclass, or in such objects
+    inside of each other. If there are none, the same object is returned.
+
+    outer: the objects in which the value is. It may be one of them.
+    """
     if isinstance(value, Field):
         return _ready(value, backend)
-    if type(value) in (list, tuple) and any(isinstance(entry, Field) for entry in value):
-        return type(value)(_ready_in(entry, backend) for entry in value)
-    return value
+    parts = _parts(value)
+    if not parts or any(value is other for other in outer):
+        return value
+    ready = {name: _ready_in(part, backend, (*outer, value)) for name, part in parts.items()}
+    if all(part is parts[name] for name, part in ready.items()):
+        return value
+    if _is_tuple(value):
+        return getattr(value, "_make", tuple)(ready.values())  # a method of named tuples
+    other = copy.copy(value)
+    has_entries = issubclass(type(value), list | dict)
+    for name, part in ready.items():
+        if has_entries:
+            other[name] = part
+        else:
+            object.__setattr__(other, name, part)  # also of frozen dataclasses
+    return other
+
+
+def _is_tuple(value: Any) -> bool:
+    """Whether a value is a tuple or a named tuple."""
+    return type(value) is tuple or (issubclass(type(value), tuple) and hasattr(value, "_make"))
+
+
+def _parts(value: Any) -> dict[Any, Any]:
+    """The entries of a list, tuple or dictionary by index or key, and the attributes of a dataclass
+    by name; none for all else."""
+    if isinstance(value, dict):
+        return cast("Any", value)
+    if isinstance(value, list) or _is_tuple(value):
+        entries: list[Any] = [*cast("Any", value)]
+        is_numbers = all(type(entry) in (float, int) for entry in entries)  # saves time
+        return {} if is_numbers else dict(enumerate(entries))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [entry.name for entry in dataclasses.fields(value)]
+        return {name: getattr(value, name) for name in names if hasattr(value, name)}
+    return {}
 
 
 def _ready(field: Field, backend: Backend) -> Field:
     """A copy of a field whose method `evaluate` is that of its evaluator on a backend."""
     other, evaluator = copy.copy(field), field.evaluator(backend)
-    object.__setattr__(other, "evaluate", evaluator.evaluate)
+    evaluate = evaluator.evaluate
+    parameters = differentiable_parameters(field)
+
+    def differentiable(p: Vec3) -> Sample:
+        """The sample at p, whose value has derivatives by the field's parameters."""
+        sample = evaluator.evaluate(p)
+        if not any(map(dr.grad_enabled, parameters)):  # as during a trace
+            return sample
+        return dataclasses.replace(sample, value=evaluator.differentiable_value(p))
+
+    has_derivatives = any(map(dr.grad_enabled, parameters))
+    object.__setattr__(other, "evaluate", differentiable if has_derivatives else evaluate)
     # The WebGPU recorder finds arrays through attributes, and a method has none.
     object.__setattr__(other, "_evaluator", evaluator)
     return other

@@ -345,14 +345,16 @@ def _check_rounding(field: Field, points: FloatArray) -> None:
 
 def _check_differentiable_value(field: Field, points: FloatArray, samples: FieldSamples) -> None:
     """Check the method `differentiable_value` of the field's evaluator at points (n, 3): it has to
-    return the value, and its derivative by the automatic differentiation of Dr.Jit, in reverse
-    mode, has to be the gradient. Raises a BrokenPromiseError if not.
+    return the value, as the field's own `evaluate` has to; and its derivative by the automatic
+    differentiation of Dr.Jit, in reverse mode, has to be the gradient. Raises a BrokenPromiseError
+    if not.
 
     samples: the samples of the field at the points.
     """
     backend = choose_backend("double")
     evaluator = field.evaluator(backend)
     x = to_vector3(backend, points, "points")
+    direct = field.evaluate(x)
     dr.enable_grad(x)
     value = evaluator.differentiable_value(x)
     # Differentiate the sum over all points: the derivative by each point is its own gradient.
@@ -366,8 +368,15 @@ def _check_differentiable_value(field: Field, points: FloatArray, samples: Field
     if isinstance(field, BatchedField):
         value_error = field.error_bound(points, precision="double")
         gradient_error = field.gradient_error_bound(points, precision="double")
-    is_right = error <= 1e-9 * (1 + np.abs(samples.value)) + 2 * samples.error + value_error
+    allowed = 1e-9 * (1 + np.abs(samples.value)) + 2 * samples.error + value_error
+    is_right = error <= allowed
     require(is_right, "differentiable_value is not the value", points, error)
+    error = np.abs(to_numpy(direct.value) - samples.value)
+    if field.period is not None:
+        error = np.abs(error - field.period * np.round(error / field.period))
+    is_right = error <= allowed + to_numpy(0 * x.x + direct.value_error)
+    message = "Field.evaluate is not the value of the evaluator that Field.evaluator returns"
+    require(is_right, message, points, error)
     error = np.linalg.norm(to_numpy(x.grad) - samples.gradient, axis=1)
     size = np.linalg.norm(samples.gradient, axis=1)
     is_right = error <= 1e-6 * size + 2 * samples.gradient_error + gradient_error

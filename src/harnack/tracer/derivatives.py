@@ -59,9 +59,10 @@ def needs_derivatives(tracer: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
             would be wrong.
     """
     field = tracer.field
-    # Plain data has no derivatives; other attributes may hide some, which raises an error. (None:
-    # the memory has a single entry for each field.)
-    if not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
+    # Plain data has no derivatives; other attributes may hide some, and so may the function of a
+    # user's class, which raises an error. (None: the memory has a single entry for each field.)
+    is_users = not type(field).__module__.startswith("harnack.")
+    if is_users or not _PARAMETER_FREE.get(field, None, lambda: is_plain_data(vars(field))):
         refuse_hidden_parameters(field)
     parameters = differentiable_parameters(tracer.field)
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)

@@ -377,8 +377,9 @@ class SolidAngle(FieldWithCells):
     ) -> npt.NDArray[Any]:
         """Evaluate the field at points (n, 3), and return what the function `choose` takes from
         each sample, such as its value. A field with FMM cells uses the same field without cells,
-        because values at points are sums over all edges."""
-        if self.cell_choice():
+        because values at points are sums over all edges. (Not if a user's class has an `evaluate`
+        of its own.)"""
+        if self.cell_choice() and type(self).evaluate is SolidAngle.evaluate:
             return self._without_cells._evaluate_points(points, precision, choose)
         return super()._evaluate_points(points, precision, choose)
 

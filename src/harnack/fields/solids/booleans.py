@@ -8,6 +8,7 @@ it."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import numbers
@@ -20,6 +21,8 @@ import numpy as np
 
 from harnack.arithmetic import maximum, minimum
 from harnack.arithmetic.norms import blend_intersection, blend_union
+from harnack.arithmetic.operators import Tally, tally_of
+from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite
 from harnack.enclosures import Enclosure, Lipschitz
@@ -27,7 +30,7 @@ from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, Negate
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import on_backend, probe_jets
+from harnack.fields.formula import on_backend, own_formula, probe_jets
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
     FormulaSolid,
@@ -164,7 +167,9 @@ class BooleanSolid(Solid):
         return _box_around_volumes(bounded)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return _extremum([part.formula(x, y, z) for part in self.parts], is_union=self.is_union)
+        return _extremum(
+            [own_formula(part)(x, y, z) for part in self.parts], is_union=self.is_union
+        )
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> BooleanSolidEvaluator:
         parts = tuple(part.evaluator(backend, plan) for part in self.parts)
@@ -463,7 +468,7 @@ class Complement(SolidOfField):
         return self.field.sublevel_extent(-level, above=not above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return -self.field.formula(x, y, z)
+        return -own_formula(self.field)(x, y, z)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         return _ComplementEvaluator(self.field.evaluator(backend, without_levels(plan)))
@@ -534,7 +539,7 @@ class OffsetSolid(SolidOfField):
         return self.field.sublevel_extent(level + self.distance, above=above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.field.formula(x, y, z) - self.distance
+        return own_formula(self.field)(x, y, z) - self.distance
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         inner = self.field.evaluator(backend, without_levels(plan))
@@ -616,7 +621,7 @@ class BlendedSolid(FormulaSolid):
         for part in self.parts:
             if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(part))
-            part.formula(*probe_jets())  # raises TypeError for a solid without a formula
+            own_formula(part)(*probe_jets())  # raises TypeError for a solid without a formula
         constants = [part.lipschitz for part in self.parts]
         all_known = all(part is not None for part in constants)
         # The constant of the blend of two functions, with a margin for rounding.
@@ -662,7 +667,16 @@ class BlendedSolid(FormulaSolid):
         # (1 - 1e-9 moves the bound upwards, by more than its rounding.)
         return self.radius - (self.radius - level) / 2 ** (1 / self.power) * (1 - 1e-9)
 
+    @property
+    def tally(self) -> Tally:
+        """The summary of the formula's operations, for an unknown radius. The formula divides by
+        the radius and multiplies by it again. So a small one makes no slope steep, and must not
+        count as a number by which f may turn sharply."""
+        other = copy.copy(self)
+        object.__setattr__(other, "radius", choose_backend("double").Float(self.radius))
+        return tally_of(other.formula)
+
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        a, b = (part.formula(x, y, z) for part in self.parts)
+        a, b = (own_formula(part)(x, y, z) for part in self.parts)
         blend = blend_union if self.is_union else blend_intersection
         return blend(a, b, self.radius, self.power)

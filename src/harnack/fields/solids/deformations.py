@@ -24,6 +24,7 @@ from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.formula import (
     FormulaEvaluator,
     FormulaFunction,
+    own_formula,
     probe_jets,
     with_device_numbers,
 )
@@ -55,7 +56,7 @@ class Deformation(SpaceMap):
         Raises:
             TypeError: the solid has no formula.
         """
-        solid.formula(*probe_jets())  # raises TypeError for a solid without a formula
+        own_formula(solid)(*probe_jets())  # raises TypeError for a solid without a formula
         return DeformedSolid(solid, self)
 
     @property
@@ -124,7 +125,7 @@ class DeformedSolid(FormulaSolid):
         return self.map.volume(self.inner.sublevel_extent(level, above=above))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.inner.formula(*self.map.preimage(x, y, z))
+        return own_formula(self.inner)(*self.map.preimage(x, y, z))
 
     def formula_on(self, backend: Backend) -> FormulaFunction:
         return _DeformedFormula(self.inner.formula_on(backend), self.map.on_backend(backend))

@@ -26,6 +26,7 @@ from harnack.fields.formula import (
     FormulaEvaluator,
     FormulaFunction,
     is_jet,
+    own_formula,
     with_device_numbers,
 )
 from harnack.fields.solids.solid import FormulaSolid
@@ -462,6 +463,8 @@ class DisplacedSolid(FormulaSolid):
             )
         if not isinstance(cast("Any", self.noise), FractalNoise):
             raise TypeError(f"noise must be Noise or FractalNoise, not {self.noise!r}")
+        for part in (self.solid, self.noise):
+            own_formula(part)  # raises TypeError for a user's class without a formula of its own
 
     @property
     def lipschitz(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -480,7 +483,7 @@ class DisplacedSolid(FormulaSolid):
         return self.solid.sublevel_extent(moved, above=above)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.solid.formula(x, y, z) + self.noise.formula(x, y, z)
+        return own_formula(self.solid)(x, y, z) + own_formula(self.noise)(x, y, z)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
         del plan

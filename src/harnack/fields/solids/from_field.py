@@ -24,7 +24,7 @@ from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.formula import Formula, is_jet, on_backend
+from harnack.fields.formula import Formula, has_own_formula, is_jet, on_backend, own_formula
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
 from harnack.fields.solids.solid import (
@@ -150,12 +150,11 @@ class SublevelSolid(SolidOfField):
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> _SublevelSolidEvaluator:
         inner = self.field.evaluator(backend, plan)
-        return _SublevelSolidEvaluator(
-            inner, type(self.field).__name__, isinstance(self.field, Formula)
-        )
+        has_formula = isinstance(self.field, Formula) and has_own_formula(self.field)
+        return _SublevelSolidEvaluator(inner, type(self.field).__name__, has_formula)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if isinstance(self.field, Formula):
+        if isinstance(self.field, Formula) and has_own_formula(self.field):
             return self.field.formula(x, y, z)
         number = x.backend_number() if is_jet(x, type(self.field).__name__) else x
         return self.evaluator(backend_of(number)).formula(x, y, z)
@@ -166,7 +165,7 @@ class _SublevelSolidEvaluator(EvaluatorOfInner):
     """The evaluator of a `SublevelSolid`, whose function is that of the field.
 
     field_name: the name of the field's class, for messages.
-    has_formula: whether the field is a `Formula`.
+    has_formula: whether the field is a `Formula` with a formula of its own function.
     """
 
     field_name: str
@@ -435,7 +434,7 @@ class BandSolid(SolidOfField):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         if not isinstance(self.field, Formula | Solid):
             return super().formula(x, y, z)
-        return abs(self.field.formula(x, y, z) - self.level) - self.half_width
+        return abs(own_formula(self.field)(x, y, z) - self.level) - self.half_width
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A volume that is proved to contain all points where the solid's function, |f -

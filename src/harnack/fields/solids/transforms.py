@@ -28,6 +28,7 @@ from harnack.fields.formula import (
     FormulaFunction,
     as_jet,
     hessian_error,
+    own_formula,
     with_device_numbers,
 )
 from harnack.fields.parameters import Parametrized
@@ -275,7 +276,7 @@ class TransformedSolid(SolidOfField):
         )
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return _formula_of_image(self.field.formula, self.inverse_map, x, y, z)
+        return _formula_of_image(own_formula(self.field), self.inverse_map, x, y, z)
 
 
 def _formula_of_image(
