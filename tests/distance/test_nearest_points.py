@@ -363,7 +363,7 @@ def test_points_of_the_boundary_and_from_very_far(name: str) -> None:
 @pytest.mark.parametrize("where", ["inside", "outside"])
 @pytest.mark.parametrize("name", ["wavy", "knot", "gyroid", "Y 5,3"])
 def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None:
-    """10,000 points, 100,000 samples of the surface and, where a ball cuts it, many of its rim."""
+    """5,000 points, 100,000 samples of the surface and, where a ball cuts it, many of its rim."""
     field = CURVED[name]
     volume = field.domain or field.extent((field.default_level,))
     assert volume is not None
@@ -371,7 +371,7 @@ def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None
     size = float(np.linalg.norm(upper - lower))
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     wide = 1.0 if where == "inside" else 2.0
-    x = middle + np.random.default_rng(14).uniform(-wide, wide, (10_000, 3)) * half
+    x = middle + np.random.default_rng(14).uniform(-wide, wide, (5_000, 3)) * half
     if field.domain is not None:
         inside = field.domain.contains_points(x)
         x = x[inside if where == "inside" else ~inside]

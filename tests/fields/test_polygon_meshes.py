@@ -192,7 +192,7 @@ def test_rays_along_edges_and_through_vertices(precision: Any, level: float) -> 
     settings: dict[str, Any] = {"level": level, "precision": precision, "tolerance": 1e-4}
     rng = np.random.default_rng(9)
     for mesh in (hostile(), hk.PolygonMesh(*patches(24))):
-        n, x = 600, mesh.vertices
+        n, x = 400, mesh.vertices
         a, b = (x[ends] for ends in mesh.edges[rng.integers(len(mesh.edges), size=n)].T)
         back = a - (b - a) * rng.uniform(1, 30, (n, 1))
         o = 2 * rng.normal(size=(n, 3))

@@ -45,7 +45,7 @@ def test_what_is_promised_along_rays_holds(thinness: float, method: str, precisi
     mesh = slivers(thinness, 12, 3)
     triangles = [mesh[0][face] for face in mesh[1]]
     backend = choose_backend(precision)  # type: ignore[arg-type]
-    x, d, _ = lines_beside(triangles, 100 if thinness == 1 else 40)
+    x, d, _ = lines_beside(triangles, 60 if thinness == 1 else 40)
     q, d[:20] = lines_in_planes(mesh, 20)
     away = 10 ** np.random.default_rng(6).uniform(-4, 0, (20, 1))
     x[:20] = q - away * unit(d[:20])
