@@ -36,7 +36,7 @@ from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fmm.edge_expansion import COEFFICIENTS, DEGREE
 from harnack.fmm.edge_lift import LiftedProduct, edge_factor_of_views, view_vertex
-from harnack.fmm.edges import Edge, EdgeSums, inner_product, spinor
+from harnack.fmm.edges import CurveSums, Edge, inner_product, spinor
 from harnack.fmm.local_expansion import evaluate_expansion
 from harnack.fmm.source_sums import SUM_MARGIN
 from harnack.fmm.trail_sums import add_edge_rates
@@ -79,7 +79,7 @@ class CurveCellSums:
     expansion_change: the value of the expansion at x minus its value at the center.
     """
 
-    sums: EdgeSums
+    sums: CurveSums
     error: Real
     slope_error: Real
     rounding: Real
@@ -103,7 +103,7 @@ class CurveCells:
     records: one record per cell. In this order it holds: the cell's center (3,), and one over the
         radius of its ball; bounds of the truncation errors of value and gradient, and of the
         rounding of the value; a lower bound of the distance of the far edges from the center; the
-        factor that multiplies `EdgeSums.inverse_squares` of the near edges; an upper bound of the
+        factor that multiplies `CurveSums.inverse_squares` of the near edges; an upper bound of the
         integral of |dp|/D^3 over the far edges, with D the distance from the center, and the
         gradient (3,) of this integral by the center; the index of the first record of near edges,
         and the number of these records; and after these `HEADER_SIZE` numbers the coefficients of
@@ -175,7 +175,7 @@ class CurveCells:
         least_over_free = far_least / far_free
         psi = dr.fma(q, dr.fma(3, q, -8), 6) * least_over_free * least_over_free * least_over_free
         far_i3 = dr.fma(inverse_cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
-        sums = EdgeSums(
+        sums = CurveSums(
             near.angle + (constant + value),
             near.gradient + slope,
             fmin(near.distance, far_free),
@@ -339,7 +339,7 @@ class CurveCells:
             for rate, length in zip(rates, lengths, strict=True)
         )
 
-    def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
+    def _sum_near(self, x: Vec3, first: Any, count: Any) -> CurveSums:
         """Sum over the near loops of a cell at points x (3, n): solid angle, gradient, distance and
         integrals, by the formulas of `edges.sum_over_edges`. Closing edges do not count in the
         distance, in `inverse_cubes` and in `inverse_fourths`, which are about the curve.
@@ -409,12 +409,8 @@ class CurveCells:
         start = (unit, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), unit,
                  unit, unit, zero, zero, zero)  # fmt: skip
         sums = dr.while_loop((index(0), *start), runs, body, label="near edges")[1:8]
-        zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = sums
-        angle = 2 * dr.atan2(zi, zr)
         # As in `edges.sum_over_edges`, the weights were half of the true ones.
-        return EdgeSums(
-            angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
-        )
+        return CurveSums.of_factors(*sums)
 
 
 def _with_edge(
