@@ -258,9 +258,9 @@ class CurveCells:
                 )
                 is_certain &= sure_x & sure_center
                 a, a_center, p = b, b_center, q
-            return i + 1, p, is_certain, *at_x.parts(), *at_center.parts()
+            return i + 1, p, is_certain, *at_x.to_state(), *at_center.to_state()
 
-        identity = LiftedProduct.identity(real).parts()
+        identity = LiftedProduct.identity(real).to_state()
         # No edge leads to the first vertex: the vertex before it may be any.
         start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
         _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")

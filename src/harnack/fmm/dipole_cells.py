@@ -199,14 +199,12 @@ class DipoleCells:
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
             )
-            new_sums, extra_state = add(
-                primitive, in_list, SourceSums.from_state(sums), extra_state
-            )
+            new_sums, extra_state = add(primitive, in_list, far.with_state(sums), extra_state)
             return i + 1, new_sums.to_state(), extra_state
 
         start = (index(0), far.to_state(), extra_state)
         _, state, extra_state = dr.while_loop(start, runs, step, label="near primitives")
-        sums, near_count = SourceSums.from_state(state), self.backend.Float(count)
+        sums, near_count = far.with_state(state), self.backend.Float(count)
         # The rounding of the additions to the gradient: a near primitive of area a is at
         # most `_NEAR` + 1 radii away, so its gradient, of order a/distance^3, is at most its part
         # of s4 times this distance.

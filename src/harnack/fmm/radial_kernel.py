@@ -31,7 +31,7 @@ import drjit as dr
 
 from harnack.backend.elementary import fmin
 from harnack.enclosures import TaylorRemainder
-from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, SymmetricMatrix
 from harnack.fmm.source_sums import SUM_MARGIN, SourceSums, SourceTerm
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class PolynomialTerm:
 
 
 @dataclass(frozen=True)
-class RadialSums:
+class RadialSums(LoopRecord):
     """Sums over all dipoles i at a point x: the value f, its derivatives, and sums from which
     bounds near x are computed. w_i = |m_i| is the weight of a dipole and d_i its distance from x.
     For a cluster, bounds of the sums over its dipoles are added. The numbers Q_2 and Q_3 bound
@@ -132,15 +132,6 @@ class RadialSums:
         only, 1 with the gradient, 2 with the Hessian."""
         zero = backend.Float(0)
         return cls(SourceSums.zero(backend, dr.inf, derivatives), zero, zero)
-
-    @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """The sums from the state of a loop, as the method `parts` returns it."""
-        return cls(SourceSums.from_state(parts[0]), *parts[1:])
-
-    def parts(self) -> tuple[Any, ...]:
-        """The numbers of `sums`, q2_d3 and q2_d4, as a tuple for the state of a recorded loop."""
-        return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
         """The sums with a further dipole or cluster, `source`, added on active lanes.

@@ -21,14 +21,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.enclosures.samples import Sample
-from harnack.fmm.point_values import PointValues, SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -120,7 +120,7 @@ class SourceTerm:
 
 
 @dataclass(frozen=True)
-class SourceSums:
+class SourceSums(LoopRecord):
     """The sums over all sources (dipoles, edges and far nodes of a tree) at points x, one point in
     each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
     follow. These numbers are the distance to the nearest singular point (a dipole or a point of an
@@ -176,26 +176,6 @@ class SourceSums:
         # The further attributes in the order of the constructor; all sums are 0.
         bounds = zero, zero, hessian_truncation, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
-
-    @classmethod
-    def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
-        """The sums that `to_state` turned into this tuple.
-
-        parts: the attributes in the order of the constructor; the Hessian is a tuple of its six
-            entries, or None.
-        """
-        total, gradient, hessian, *bounds = parts
-        return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
-
-    def to_state(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, as a tuple for the state of a recorded
-        loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None,
-        and not arrays of zeros: Dr.Jit records a loop a second time if an array of its state never
-        changes."""
-        hessian = None if self.hessian is None else self.hessian.components()
-        bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
-        ends = self.singularity_distance, self.s4, self.s5, self.compensation
-        return self.total, self.gradient, hessian, *bounds, *ends
 
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
         """The sums `other` on the lanes on which the mask is true, and these sums on all other

@@ -142,7 +142,7 @@ class ExactWinding:
             # Value and its error, gradient, Hessian, and the errors of both.
             zeros = self.backend.Array3f(0), SymmetricMatrix.zero(real)
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
-        sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
+        sums, unit = lifted_sums(self.edges, x, derivatives), coordinate_rounding(x)
         # The sums are solid angles: 4 pi w.
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         return sums.values(_PER_SPHERE, unit, self.rounding)

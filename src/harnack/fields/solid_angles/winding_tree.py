@@ -35,7 +35,7 @@ import numpy as np
 from harnack.backend.elementary import fmax
 from harnack.fmm.dipole_cells import DipoleCells, build_cells
 from harnack.fmm.dipole_expansion import TRIANGLE_RATIO, triangle_sources
-from harnack.fmm.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
+from harnack.fmm.edge_lift import LiftedEdge, LiftedProduct
 from harnack.fmm.source_sums import SourceSums, final_rounding
 from harnack.fmm.trail_sums import RayLine, add_edge_rates, lipschitz_along
 from harnack.fmm.treecode import Treecode
@@ -240,7 +240,7 @@ class TreeWinding:
         active_lanes: the mask of the lanes on which sums are wanted.
         """
         # Angles of edges are added as the argument of a product of complex factors.
-        start = LiftedProduct.identity(self.backend.Float).parts()
+        no_factors = LiftedProduct.identity(self.backend.Float)
 
         def adder(reach: Real) -> AddPrimitive:
             """Make the function that adds a near triangle to sums at points x of the rays `frame`,
@@ -257,15 +257,17 @@ class TreeWinding:
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
                 turns = turns + dr.select(active & is_ahead(row, t), sign, 0)
-                lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
+                product = LiftedProduct(re, im, turns)
                 for edge in edges_of(row, x, frame):
-                    lifted = lifted.add_edge(edge.edge, unit, active & edge.is_open(reach))
-                return lifted.sums, lifted.product.parts()
+                    is_open = active & edge.is_open(reach)
+                    sums, product = edge.edge.add_to(sums, product, unit, is_open)
+                return sums, product.to_state()
 
             return add
 
+        start = no_factors.to_state()
         sums, product = self._near_sums(x, detail, adder, start, active_lanes, derivatives)
-        return LiftedSums(sums, LiftedProduct(*product)).total()
+        return no_factors.with_state(product).add_angle_to(sums)
 
     def _near_sums(
         self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
