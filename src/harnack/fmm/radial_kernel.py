@@ -29,10 +29,11 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import TaylorRemainder
-from harnack.fmm.point_values import LoopRecord, SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, PointValues, SymmetricMatrix
 from harnack.fmm.source_sums import SUM_MARGIN, SourceSums, SourceTerm
+from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -169,6 +170,18 @@ class RadialSums(LoopRecord):
             s5=sums.s5 + q3_d5,
         )
         return RadialSums(sums, self.q2_d3 + q2_d3, self.q2_d4 + q2_d4)
+
+    def values(self, x: Vec3) -> PointValues:
+        """The value at the points x of these sums, and those of its derivatives that were summed,
+        with error bounds."""
+        rounding = 16 * float(dr.epsilon(self.q2_d3)) * dr.abs(self.sums.value)
+        return self.sums.values(1.0, coordinate_rounding(x), rounding)
+
+    @property
+    def least_distance(self) -> Real:
+        """A lower bound of the distance to the nearest dipole, also after rounding."""
+        distance = self.sums.singularity_distance * (1 - SUM_MARGIN)
+        return fmax(distance - 16 * float(dr.epsilon(self.q2_d3)), 0)
 
     def remainder(self, share: float, r: Real, growth: Real) -> Real:
         """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r.

@@ -189,6 +189,13 @@ class SourceSums(LoopRecord):
         """The order up to which derivatives are summed: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
 
+    def gradient_error(self, unit: Real) -> Real:
+        """A bound of the error of the gradient, by truncation and by the rounding of positions.
+
+        unit: a bound of the rounding error of a coordinate.
+        """
+        return dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
         """These sums plus the contribution of one more source, on the active lanes. A derivative
         that is None in `terms` counts as 0. terms: what the source adds.
@@ -335,7 +342,7 @@ class SourceSums(LoopRecord):
         1/coarse_ratio times the distance of the center, and `max_step_fraction` is less than that.
         """
         g = share * self.gradient
-        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        slope_error = share * self.gradient_error(unit)
         # The distance to the nearest singular point, reduced for rounding.
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
         # A TaylorRemainder bounds the second derivative, so its constant is twice that of t^2.

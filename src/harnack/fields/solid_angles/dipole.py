@@ -47,7 +47,7 @@ from harnack.fmm.treecode import (
     dipole_records,
     records_in_slots,
 )
-from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
+from harnack.fmm.unit_frame import UnitFrame, center_and_size, coordinate_rounding, frame_parameters
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -394,12 +394,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
         self.accuracy = accuracy
         self.configure_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
-        # Unit coordinates: relative to the center, over a power of two as size, so that the
-        # division does not round. The size is no smaller than a quarter of the root of the total
-        # area: some clouds have areas that are large for their box.
-        self._center = round_to_single(0.5 * (low + high))
-        extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
-        self._size = 2.0 ** math.ceil(math.log2(extent))
+        # The size is no smaller than a quarter of the root of the total area: some clouds have
+        # areas that are large for their box.
+        least_size = math.sqrt(float(self.areas.sum())) / 4
+        self._center, self._size = center_and_size(low, high, least_size)
         # The hierarchy of the tree of the field from which `with_points` made this one.
         self._given_hierarchy: BalancedTree | None = None
         self._smoothing = (
