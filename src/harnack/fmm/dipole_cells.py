@@ -7,6 +7,7 @@ cell's center. So the cost of a sample depends only on the number of near primit
 are in unit coordinates, in which the data have a size of about one.
 
 - `DipoleCells`: the cells on a backend.
+- `TreeWithCells`: sums by cells, or by a tree.
 - `build_cells`: builds the cells, one octree level at a time, from the moments of a tree.
 
 Construction. The expansions have degree 6 and are computed from the multipole moments of the nodes
@@ -41,6 +42,7 @@ from harnack.backend.record_table import RecordTable
 from harnack.fmm.dipole_expansion import (
     COEFFICIENTS,
     DEGREE,
+    TRIANGLE_RATIO,
     DipoleExpansions,
     PendingSources,
     source_tree,
@@ -212,28 +214,63 @@ class DipoleCells:
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, extra_state, active
 
-    def sums_with_tree(
-        self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        extra_state: tuple[Any, ...], active_lanes: Mask = True,
-    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """Sum over all primitives at points x, with gradients: by the cells where they are accurate
-        enough, and by a tree elsewhere. The cells are used on lanes on which the accuracy scale is
-        at most 1 and x is in the cube.
 
-        tree: a tree over the same primitives.
-        x: (3, n), in unit coordinates.
+@dataclass(frozen=True)
+class TreeWithCells:
+    """A sum over dipoles or triangles (the primitives) on a backend: by FMM cells if there are any,
+    and by a tree elsewhere. All is in unit coordinates, in which the data have a size of about one.
+
+    clusters: the tree with its multipole moments.
+    rounding: a bound of the rounding of the last operations, which turn the sums into the result.
+    cells: FMM cells of the same primitives, with which the cost of a sample depends only on the
+        number of near primitives; None for no cells.
+    """
+
+    clusters: Treecode
+    rounding: Real
+    cells: DipoleCells | None = None
+
+    @property
+    def backend(self) -> Backend:
+        return self.clusters.backend
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The smallest accuracy scale that makes a difference: a smaller one gives the same samples
+        (`VariableAccuracy.coarsest`). It is 1 if there are cells, which have a single accuracy."""
+        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
+
+    def sums(
+        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive],
+        extra_state: tuple[Any, ...], active: Mask = True, derivatives: int = 1,
+    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
+        """Sum over all primitives at points x. The cells are used on lanes on which the accuracy
+        scale is at most 1 and x is in their cube, unless second derivatives are requested.
+
+        x: (3, n).
         detail: the accuracy scale; larger is more accurate.
-        add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
-            sums of a cell, the second to the sums of the tree.
-        extra_state: a further state of the caller, which `add` updates.
-        active_lanes: the mask of the lanes to compute.
+        adder: a function that makes the function that adds a near primitive
+            (`treecode.AddPrimitive`). Its argument is a number: primitives are near if they are
+            within about so many times their size.
+        extra_state: a further state of the caller, which the made function updates.
+        active: the mask of the lanes to compute.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian. If there are
+            cells, 0 counts as 1.
 
         Returns the sums, and the new state of the caller.
         """
-        in_cell, in_tree = add
-        lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
-        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, extra_state)
-        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, extra_state, lanes & ~is_valid)
+        if self.cells is None or derivatives == 2:
+            add = adder(self.clusters.acceptance_ratio(detail))
+            return self.clusters.sums(x, detail, add, extra_state, active, derivatives=derivatives)
+        # The tree is at least as accurate as the cells: x may be outside of the cube at a smaller
+        # scale.
+        lanes, tree_detail = self.backend.Bool(active), fmax(detail, self.backend.Float(1))
+        in_cell = adder(self.backend.Float(TRIANGLE_RATIO))
+        in_tree = adder(self.clusters.acceptance_ratio(tree_detail))
+        sums, state, is_valid = self.cells.sums(x, lanes & (detail <= 1), in_cell, extra_state)
+        tree_sums, tree_state = self.clusters.sums(
+            x, tree_detail, in_tree, extra_state, lanes & ~is_valid
+        )
         pairs = zip(state, tree_state, strict=True)
         state = tuple(dr.select(is_valid, ours, theirs) for ours, theirs in pairs)
         return sums.select(~is_valid, tree_sums), state

@@ -101,7 +101,7 @@ class ExactWinding:
     has_detail: ClassVar[bool] = False
     """Whether samples at small accuracy scales take less time. They do not: all are exact."""
 
-    coarsest_detail: ClassVar[float] = 0.5
+    coarsest_accuracy: ClassVar[float] = 0.5
     """The smallest accuracy scale that makes a difference (`VariableAccuracy.coarsest`). Only FMM
     cells of the boundary distinguish it from 1, so that any number below 1 will do."""
 
