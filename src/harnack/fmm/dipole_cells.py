@@ -55,13 +55,7 @@ from harnack.fmm.local_expansion import (
 from harnack.fmm.source_sums import SUM_MARGIN, SourceSums
 from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree import NO_PRIMITIVE
-from harnack.tree.octree_lookup import (
-    BALL_MARGIN,
-    MAX_DEPTH,
-    OCTANT_DIRECTIONS,
-    OctreeLookup,
-    encode_nodes,
-)
+from harnack.tree.octree_lookup import BALL_MARGIN, OCTANT_OFFSET, OctreeCells, OctreeLookup
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -296,20 +290,16 @@ def _truncation_at(
 
 
 @dataclass(frozen=True)
-class _CellLevel:
-    """The cells at one depth of the octree, which all have the same size.
+class _CountedCells(OctreeCells):
+    """The cells at one depth of the octree, with the numbers of their near primitives.
 
-    centers: (n, 3) centers of the cells.
-    radius: the radius of their balls.
     is_leaf: (n,) whether a cell is not split.
     near: (n,) the number of near primitives of each cell. For a cell that is split it is only a
         number above the limit, as counting stops there.
     """
 
-    centers: FloatArray
-    radius: float
-    is_leaf: BoolArray
-    near: IntArray
+    is_leaf: BoolArray = dataclasses.field(kw_only=True)
+    near: IntArray = dataclasses.field(kw_only=True)
 
 
 def build_cells(
@@ -346,23 +336,24 @@ def build_cells(
     if finer:
         start_near = int(_FINER_FRACTION * start_near)
     if packed.primitives.packets_per_record > 1:  # triangles; the record of a dipole is one packet
-        limit = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
-        max_near = max(_MOST_NEAR, min(_MAX_NEAR, limit))
-    octree = _octree_within_memory(packed, half, backend, (start_near, max_near), most_bytes)
-    if octree is None:
-        return None
-    double, shifts = (
-        packed.backend,
-        local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN)),
-    )
+        fraction = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
+        max_near = max(_MOST_NEAR, min(_MAX_NEAR, fraction))
+    # Cells are split if they have more near primitives than a limit, which is doubled until they
+    # take little enough memory. Beyond `max_near`, lists of near primitives take nearly as much
+    # memory, whatever the size of the cells.
+    limit = start_near
+    while (octree := _octree(packed, half, limit, backend, most_bytes)) is None:
+        if limit >= max_near:
+            return None
+        limit = min(2 * limit, max_near)
+    double, shifts = packed.backend, local_to_local_matrices(DEGREE, OCTANT_OFFSET)
     sources, parents = (
         PendingSources.of_root(double),
         _ParentExpansions(DipoleExpansions.zero(1), shifts, 0.0),
     )
-    nodes: list[IntArray] = []
     tables: list[npt.NDArray[Any]] = []
     near: list[npt.NDArray[Any]] = []
-    split_count, leaf_count, near_count = 0, 0, 0
+    near_count = 0
     # Each pass adds the cells of one depth: first the cells that are not split, then the others.
     # `sources` has the sources that are left to each cell of this depth, `parents` the expansions
     # that they inherit. With the negative radius `none_stay`, `split_far` replaces every near node
@@ -381,8 +372,6 @@ def build_cells(
             tables.append(table.astype(backend.dtype))
             near.append(to_numpy(nearby.primitives.entries)[: int(lengths.sum())])
             near_count += int(lengths.sum())
-        nodes.append(encode_nodes(level.is_leaf, leaf_count, split_count))
-        leaf_count, split_count = leaf_count + len(leaves), split_count + len(split)
         # A cell that is split hands its expansion and its remaining sources to its eight octants.
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
@@ -401,11 +390,12 @@ def build_cells(
                 double, np.repeat(np.arange(len(split)), 8)
             )
     table, entries = np.concatenate(tables), np.concatenate(near)
+    levels_of_leaves = [level.is_leaf for level in octree]
     return DipoleCells(
-        backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, nodes),
+        backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, levels_of_leaves),
         RecordTable.upload(backend, table),
         upload_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
-        leaf_count, _bytes(backend, octree),
+        len(table), _bytes(backend, octree),
     )  # fmt: skip
 
 
@@ -474,79 +464,46 @@ def _cell_records(
     return np.column_stack([*head, sums.coefficients])
 
 
-def _octree_within_memory(
-    packed: PackedTree, half_side: float, backend: Backend, limits: tuple[int, int], most_bytes: int
-) -> list[_CellLevel] | None:
-    """Choose the cells of the cube [-half_side, half_side]^3 so that they take at most `most_bytes`
-    bytes. A cell is split if it has more near primitives than a limit. Limits are tried in turn,
-    each one twice the previous one, until the cells are small enough.
-
-    packed: the tree of the primitives.
-    limits: the first limit to try, and the largest limit. Beyond the largest limit, lists of near
-        primitives take nearly as much memory, whatever the size of the cells.
-
-    Returns one entry for each depth of the octree; or None if the cells take too much memory even
-    with the largest limit.
-    """
-
-    def is_too_large(levels: list[_CellLevel]) -> bool:
-        """Whether cells take more than `most_bytes` bytes. levels: the cells of each depth."""
-        return _bytes(backend, levels) > most_bytes
-
-    limit, max_near = limits
-    # Double the limit until the cells are small enough in memory.
-    while (octree := _octree(packed, half_side, limit, is_too_large)) is None and limit < max_near:
-        limit = min(2 * limit, max_near)
-    return octree
-
-
 def _octree(
-    packed: PackedTree,
-    half_side: float,
-    max_near: int,
-    is_too_large: Callable[[list[_CellLevel]], bool],
-) -> list[_CellLevel] | None:
+    packed: PackedTree, half_side: float, max_near: int, backend: Backend, most_bytes: int
+) -> list[_CountedCells] | None:
     """Divide the cube [-half_side, half_side]^3 into the cells of an octree. A cell is split if too
     many primitives are near to it, that is, within `_NEAR` radii of its ball from its center. Cells
-    at the depth `MAX_DEPTH` are not split in any case.
+    of the greatest depth are not split in any case.
 
     packed: the tree of the primitives.
     max_near: a cell is split if it has more near primitives than this.
-    is_too_large: a function that says whether the cells so far take too much memory.
+    backend: the backend of the finished cells.
+    most_bytes: the number of bytes that they may take.
 
-    Returns one entry for each depth of the octree, or None if the cells take too much memory.
+    Returns one entry for each depth of the octree, or None if the cells take more memory.
     """
-    backend = packed.backend
-    root = PendingSources.of_root(backend)
-    levels: list[_CellLevel] = []
-    centers = np.zeros((1, 3))
-    while len(centers):
-        cell_half_side = half_side / 2 ** len(levels)
-        radius = math.sqrt(3) * cell_half_side * BALL_MARGIN
-        is_last = len(levels) == MAX_DEPTH
+    double = packed.backend
+    root = PendingSources.of_root(double)
+    levels: list[_CountedCells] = []
+    cells = OctreeCells(np.zeros((1, 3)), half_side)
+    while len(cells.centers):
         # Counting stops above the limit; cells of the last depth need the exact number. With the
         # negative radius `none_stay`, near nodes are replaced by their primitives.
-        limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else max_near)
-        near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
+        limit = dr.opaque(double.UInt32, _UNLIMITED if cells.is_last else max_near)
+        near, none_stay = (dr.opaque(double.Float, length) for length in (_NEAR * cells.radius, -1))
         # Each cell searches the whole tree for its near primitives.
         roots, c = (
-            root.subset(backend, np.zeros(len(centers), np.int64)),
-            to_vector3(backend, centers),
+            root.subset(double, np.zeros(len(cells.centers), np.int64)),
+            to_vector3(double, cells.centers),
         )
         # None: primitives are counted, and not stored.
         counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, count_limit=limit)
         count = to_numpy(counts).astype(np.int64)
-        is_leaf = np.broadcast_to(count <= max_near, len(centers)) | is_last
-        levels.append(_CellLevel(centers, radius, is_leaf, count))
-        if is_too_large(levels):
+        is_leaf = np.broadcast_to(count <= max_near, len(cells.centers)) | cells.is_last
+        levels.append(_CountedCells(**vars(cells), is_leaf=is_leaf, near=count))
+        if _bytes(backend, levels) > most_bytes:
             return None
-        centers = (centers[~is_leaf][:, None] + 0.5 * cell_half_side * OCTANT_DIRECTIONS).reshape(
-            -1, 3
-        )
+        cells = cells.octants(~is_leaf)
     return levels
 
 
-def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
+def _bytes(backend: Backend, levels: list[_CountedCells]) -> int:
     """Compute the number of bytes that cells take: their records, their lists of near primitives,
     and the octree's nodes.
 
@@ -558,7 +515,6 @@ def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
         leaves += int(level.is_leaf.sum())
         near += int(level.near[level.is_leaf].sum())
     nodes = sum(len(level.is_leaf) for level in levels)
-    # A record takes a multiple of eight numbers.
-    record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
+    records = RecordTable.memory_bytes(backend, leaves, _HEADER_SIZE + COEFFICIENTS)
     # The index of a near primitive takes four bytes.
-    return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)
+    return records + 4 * near + OctreeLookup.memory_bytes(nodes)
