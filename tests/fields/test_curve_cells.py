@@ -342,7 +342,7 @@ def test_the_bound_of_bending_is_attained() -> None:
     table = to_numpy(on.cells.records.buffer).reshape(on.cells.count, -1)
     x = to_vector3(backend, table[:, :3])
     found, in_cells = on.cells.sums(x, dr.full(backend.Bool, True, on.cells.count))
-    used = to_numpy(found.sums.inverse_cubes) / to_numpy(on.sums(x).inverse_cubes)
+    used = to_numpy(found.sums.inverse_cubes) / to_numpy(on.sums(x)[0].inverse_cubes)
     assert to_numpy(in_cells).all()
     assert used.min() >= 1 - 1e-9
     for count in (table[:, 14] == 0, table[:, 14] > 0):

@@ -24,7 +24,7 @@ def test_rounding_of_a_product_grows_with_its_factors() -> None:
     for k in range(count):
         product = product.times(one, small)
         if k % 20 == 0:
-            dr.eval(*product.parts())
+            dr.eval(*product.to_state())
     exact = np.arctan2(im.astype(float), re.astype(float)) + count * np.arctan(turn.astype(float))
     error = np.abs(product.angle().numpy() - 2 * exact).max()
     bound = FACTOR_ROUNDINGS * UNIT * count

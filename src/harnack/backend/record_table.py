@@ -87,6 +87,11 @@ class RecordTable:
             backend, padded, padded_width // PACKET, at_once, dr.opaque(backend.UInt32, iterations)
         )
 
+    @staticmethod
+    def memory_bytes(backend: Backend, records: int, width: int) -> int:
+        """The memory in bytes of a table of so many records of `width` numbers, with padding."""
+        return records * -(-width // PACKET) * PACKET * np.dtype(backend.dtype).itemsize
+
     def view(self, first: Any, trips: Any) -> RecordTable:
         """Return a part of the table: `trips` consecutive records, from record `first` on. Both
         numbers may differ between lanes. An iteration of `for_each` must read a single record.

@@ -22,6 +22,7 @@ import numpy as np
 
 from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.record_table import RecordTable
+from harnack.fmm.edges import CurveSums
 from harnack.fmm.point_values import SymmetricMatrix
 
 if TYPE_CHECKING:
@@ -182,26 +183,15 @@ class UnitCircle:
 
 
 @dataclass(frozen=True)
-class CircleSums:
-    """Quantities of a set of circles at a point x, summed over the circles: the solid angle that
-    they subtend at x, its gradient, the distance, and integrals that bound derivatives.
+class CircleSums(CurveSums):
+    """Sums over a set of circles at a point x. The angle is the sum of the circles' solid angles,
+    each in (-2 pi, 2 pi). Only `inverse_fourths` is an upper bound; the distance and the other two
+    integrals are those of the circles.
 
-    angle: the sum of the circles' solid angles, seen from x, each in (-2 pi, 2 pi).
-    gradient: (3,) its gradient.
-    distance: the distance from x to the nearest circle.
-    inverse_squares, inverse_cubes: the integrals of |dp|/D^2 and |dp|/D^3 along the circles, with D
-        the distance from x to the point p of a circle.
-    inverse_fourths: an upper bound of the integral of |dp|/D^4.
     lower, upper: bounds of the angle on the ball around x of radius `distance`, if it is continued
         from x without its jumps of 4 pi (`planar` has the proof).
     """
 
-    angle: Real
-    gradient: Vec3
-    distance: Real
-    inverse_squares: Real
-    inverse_cubes: Real
-    inverse_fourths: Real
     lower: Real
     upper: Real
 
@@ -299,13 +289,9 @@ class CircleSet:
             )
 
         start = (real(0), vector(0), real(dr.inf), real(0), real(0), real(0), real(0))
-        angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower = (
-            self.records.for_each(add, start, "circles")
-        )
+        *sums, lower = self.records.for_each(add, start, "circles")
         upper = lower + 4 * math.pi * real(self.records.iteration_count)
-        return CircleSums(
-            angle, gradient, distance, inverse_squares, inverse_cubes, inverse_fourths, lower, upper
-        )
+        return CircleSums(*sums, lower=lower, upper=upper)
 
     def hessian(self, x: Vec3) -> SymmetricMatrix:
         """Compute the Hessian of the sum of the circles' solid angles at points x (3, n), in unit

@@ -33,13 +33,7 @@ from harnack.fmm.edge_runs import EdgeRuns, VertexTable, subtract_runs
 from harnack.fmm.edges import Edge, LoopEdges, inverse_squares
 from harnack.fmm.local_expansion import local_to_local_matrices, rounding_tables
 from harnack.tree.closest_triangles import squared_distance_to_segment
-from harnack.tree.octree_lookup import (
-    BALL_MARGIN,
-    MAX_DEPTH,
-    OCTANT_DIRECTIONS,
-    OctreeLookup,
-    encode_nodes,
-)
+from harnack.tree.octree_lookup import BALL_MARGIN, OCTANT_OFFSET, OctreeCells, OctreeLookup
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -128,11 +122,9 @@ class _CurveCellBuilder:
         truncation error is more than `max_tail_ratio` times the integral of |dp|/D^2.
     parent_ratio: edges are near to a cell that is split if they are within this many radii of its
         ball from its center.
-    nodes: the octree's nodes at each depth so far, for `OctreeLookup.from_levels`.
+    levels: for each depth so far, the mask (n,) of the cells that are not split.
     tables: the records of the cells so far that are not split, as in `CurveCells.records`.
     near: the records of their near edges, as in `CurveCells.near`.
-    leaves: the number of cells so far that are not split.
-    near_record_count: the number of records of near edges so far.
     """
 
     backend: Backend
@@ -143,71 +135,43 @@ class _CurveCellBuilder:
     most_near: float
     max_tail_ratio: float
     parent_ratio: float
-    nodes: list[IntArray] = field(default_factory=list[IntArray])
+    levels: list[BoolArray] = field(default_factory=list[BoolArray])
     tables: list[FloatArray] = field(default_factory=list[FloatArray])
     near: list[FloatArray] = field(default_factory=list[FloatArray])
-    leaves: int = 0
-    near_record_count: int = 0
 
     def grow(self, most_bytes: int) -> bool:
         """Build all cells, one depth of the octree after the other. Returns False as soon as the
         cells exceed `most_bytes` or there are too many records of near edges, and True when all are
         built."""
-        # far: the expansions of the cells of a depth; split_count: the cells split so far. An
-        # octant's center is half of the half side from the cell's center along each axis, and the
-        # ball's radius is sqrt(3) BALL_MARGIN half sides: hence the offset in units of the radius.
-        shifts = local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN))
-        # The first depth has one cell, the cube.
-        centers, runs, far = (
-            self.middle[None],
-            EdgeRuns.of_loops(self.vertices),
-            EdgeExpansions.zero(1),
-        )
-        split_count = 0
-        for depth in range(MAX_DEPTH + 1):
-            half_side = self.half / 2**depth
-            radius = math.sqrt(3) * half_side * BALL_MARGIN
-            is_leaf, runs, far = self._build_depth(
-                centers, radius, runs, far, is_last=depth == MAX_DEPTH
-            )
-            split = np.flatnonzero(~is_leaf)
-            # The index of the first cell of this depth that is not split, and of the first that is.
-            self.nodes.append(encode_nodes(is_leaf, self.leaves - int(is_leaf.sum()), split_count))
-            split_count += len(split)
-            # self.size: the number of bytes so far. self.leaves: the number of cells so far that
-            # are not split.
-            if self.size > most_bytes or self.near_record_count >= _MAX_RECORDS:
+        shifts = local_to_local_matrices(DEGREE, OCTANT_OFFSET)
+        # The first depth has one cell, the cube. far: the expansions of the cells of a depth.
+        cells = OctreeCells(self.middle[None], self.half)
+        runs, far = EdgeRuns.of_loops(self.vertices), EdgeExpansions.zero(1)
+        while len(cells.centers):
+            is_leaf, runs, far = self._build_depth(cells, runs, far)
+            self.levels.append(is_leaf)
+            if self.size > most_bytes or sum(map(len, self.near)) >= _MAX_RECORDS:
                 return False
-            if not len(split):
-                break
-            runs, far = runs.to_octants(~is_leaf), far.to_octants(~is_leaf, shifts, radius)
-            centers = (centers[split][:, None] + 0.5 * half_side * OCTANT_DIRECTIONS).reshape(-1, 3)
+            runs, far = runs.to_octants(~is_leaf), far.to_octants(~is_leaf, shifts, cells.radius)
+            cells = cells.octants(~is_leaf)
         return True
 
     def _build_depth(
-        self,
-        centers: FloatArray,
-        radius: float,
-        runs: EdgeRuns,
-        far: EdgeExpansions,
-        *,
-        is_last: bool,
+        self, cells: OctreeCells, runs: EdgeRuns, far: EdgeExpansions
     ) -> tuple[BoolArray, EdgeRuns, EdgeExpansions]:
         """Build the n cells of one depth of the octree, and decide which of them are split. Records
         of the cells that are not split are appended to `tables` and `near`.
 
-        centers: (n, 3) of the cells.
-        radius: the radius of their balls.
         runs: the near runs that the cells inherit from their parents.
         far: the expansions of far edges that the cells inherit from their parents.
-        is_last: whether no cell may be split any more.
 
         Returns the mask (n,) of the cells that are not split, and the near runs and the expansions
         of all n cells.
         """
         # run, cell, distance: for each edge of the inherited runs, the index of its run, the index
         # of its cell, and its distance from the cell's center.
-        double, n = choose_backend("double"), len(centers)
+        double, n = choose_backend("double"), len(cells.centers)
+        centers, radius = cells.centers, cells.radius
         run, vertex_ids = runs.edges()
         cell = runs.cell[run]
         distance = _distances(self.vertices, centers, cell, vertex_ids, double)
@@ -215,7 +179,7 @@ class _CurveCellBuilder:
         far_bounds = _FarBounds.of(self.edges, centers, radius)
         is_leaf = (near_count <= self.most_near) & (
             far_bounds.tail <= self.max_tail_ratio * far_bounds.total
-        ) | is_last
+        ) | cells.is_last
         # The runs of near edges, closed again; all other edges go into the expansion. Cells that
         # are split keep edges up to `parent_ratio` radii, for their octants.
         near_radius = np.where(is_leaf, _NEAR_RADII, self.parent_ratio) * radius
@@ -245,42 +209,36 @@ class _CurveCellBuilder:
             near_table, first_record, record_counts = near_records(
                 self.vertices, near_runs, is_leaf
             )
-            self.near.append(near_table)
             factor = _rounding_factor(self.vertices, near_runs, centers, radius)[is_leaf]
             bounds = far.subset(is_leaf), far_bounds.subset(is_leaf), factor
-            near_range = self.near_record_count + first_record, record_counts
+            near_range = sum(map(len, self.near)) + first_record, record_counts
             records = _cell_records(self.backend, centers[is_leaf], radius, *bounds, *near_range)
             self.tables.append(records)
-            self.leaves, self.near_record_count = (
-                self.leaves + len(records),
-                self.near_record_count + len(near_table),
-            )
+            self.near.append(near_table)
         return is_leaf, near_runs, far
 
     @property
     def size(self) -> int:
         """The number of bytes of all cells so far: their records, the records of their near edges,
         and the octree with its lookup grid."""
-        number_size = np.dtype(self.backend.dtype).itemsize
-        # A record takes a multiple of eight numbers. A vertex of near edges takes four.
-        record = 8 * -(-(HEADER_SIZE + COEFFICIENTS) // 8)
-        lookup = OctreeLookup.memory_bytes(sum(len(level) for level in self.nodes))
-        return (
-            number_size * (record * self.leaves + 4 * VERTICES_PER_RECORD * self.near_record_count)
-            + lookup
+        # A vertex of near edges takes four numbers.
+        tables = (self.tables, HEADER_SIZE + COEFFICIENTS), (self.near, 4 * VERTICES_PER_RECORD)
+        return OctreeLookup.memory_bytes(sum(map(len, self.levels))) + sum(
+            RecordTable.memory_bytes(self.backend, sum(map(len, parts)), width)
+            for parts, width in tables
         )
 
     def cells(self) -> CurveCells:
         """Upload the finished cells to the backend."""
         backend = self.backend
         lookup = OctreeLookup.from_levels(
-            backend, self.middle - self.half, 2 * self.half, self.nodes
+            backend, self.middle - self.half, 2 * self.half, self.levels
         )
         # One more record, so that the table is not empty if no cell has near edges.
         near = np.concatenate([*self.near, np.zeros((1, 4 * VERTICES_PER_RECORD))])
-        records = RecordTable.upload(backend, np.concatenate(self.tables))
-        near_edges = RecordTable.upload(backend, near)
-        return CurveCells(backend, lookup, records, near_edges, self.leaves, self.size)
+        table = np.concatenate(self.tables)
+        records, near_edges = (RecordTable.upload(backend, rows) for rows in (table, near))
+        return CurveCells(backend, lookup, records, near_edges, len(table), self.size)
 
 
 @dataclass(frozen=True)

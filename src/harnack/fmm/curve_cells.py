@@ -36,7 +36,7 @@ from harnack.backend import to_numpy
 from harnack.backend.elementary import fmin
 from harnack.fmm.edge_expansion import COEFFICIENTS, DEGREE
 from harnack.fmm.edge_lift import LiftedProduct, edge_factor_of_views, view_vertex
-from harnack.fmm.edges import Edge, EdgeSums, inner_product, spinor
+from harnack.fmm.edges import CurveSums, Edge, inner_product, spinor
 from harnack.fmm.local_expansion import evaluate_expansion
 from harnack.fmm.source_sums import SUM_MARGIN
 from harnack.fmm.trail_sums import add_edge_rates
@@ -79,7 +79,7 @@ class CurveCellSums:
     expansion_change: the value of the expansion at x minus its value at the center.
     """
 
-    sums: EdgeSums
+    sums: CurveSums
     error: Real
     slope_error: Real
     rounding: Real
@@ -103,7 +103,7 @@ class CurveCells:
     records: one record per cell. In this order it holds: the cell's center (3,), and one over the
         radius of its ball; bounds of the truncation errors of value and gradient, and of the
         rounding of the value; a lower bound of the distance of the far edges from the center; the
-        factor that multiplies `EdgeSums.inverse_squares` of the near edges; an upper bound of the
+        factor that multiplies `CurveSums.inverse_squares` of the near edges; an upper bound of the
         integral of |dp|/D^3 over the far edges, with D the distance from the center, and the
         gradient (3,) of this integral by the center; the index of the first record of near edges,
         and the number of these records; and after these `HEADER_SIZE` numbers the coefficients of
@@ -175,7 +175,7 @@ class CurveCells:
         least_over_free = far_least / far_free
         psi = dr.fma(q, dr.fma(3, q, -8), 6) * least_over_free * least_over_free * least_over_free
         far_i3 = dr.fma(inverse_cubes, dr.fma(dr.square(q), psi, 1), dr.dot(u, vector(*row[10:13])))
-        sums = EdgeSums(
+        sums = CurveSums(
             near.angle + (constant + value),
             near.gradient + slope,
             fmin(near.distance, far_free),
@@ -221,28 +221,21 @@ class CurveCells:
         an edge's factor are off by that times the coordinates of the ends. Only for factors near
         the negative real axis it is then open in which direction they turn.
         """
-        real, vector, index = self.backend.Float, self.backend.Array3f, self.backend.UInt32
-        count, center = dr.select(active, cell_sums.count, 0), cell_sums.center
+        vector = self.backend.Array3f
+        center, no_factors = cell_sums.center, LiftedProduct.identity(self.backend.Float)
 
-        def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near
-            edges."""
-            return i < count
-
-        def body(i: Any, p: Vec3, is_certain: Mask, *products: Real) -> tuple[Any, ...]:
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """Multiply two products of edge factors, one at x and one at the cell's center, by the
-            factors of the near edges in record i of the cell, as seen along the rays `frame` from
-            the center to x. `count` is the number of these records, and `unit` bounds the rounding
-            of a coordinate. `cell_sums` tells which cell it is.
+            factors of the near edges in the record `row` of the cell, as seen along the rays
+            `frame` from the center to x. `unit` bounds the rounding of a coordinate.
 
-            p: the vertex before the record.
-            is_certain: the mask of the lanes on which no rounding has mattered so far.
-            products: the attributes of the product at x, then those of the product at the center.
+            state: the vertex before the record; the mask of the lanes on which no rounding has
+                mattered so far; the product at x, and the product at the center.
 
-            Returns the arguments for the next record.
+            Returns the new state.
             """
-            row = self.near.read_record(cell_sums.near_first + i, i < count)
-            at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+            p, is_certain, *products = state
+            at_x, at_center = (no_factors.with_state(product) for product in products)
             a, a_center = view_vertex(p, frame, x), view_vertex(p, frame, center)
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
@@ -258,13 +251,13 @@ class CurveCells:
                 )
                 is_certain &= sure_x & sure_center
                 a, a_center, p = b, b_center, q
-            return i + 1, p, is_certain, *at_x.parts(), *at_center.parts()
+            return p, is_certain, at_x.to_state(), at_center.to_state()
 
-        identity = LiftedProduct.identity(real).parts()
         # No edge leads to the first vertex: the vertex before it may be any.
-        start = index(0), vector(0), self.backend.Bool(active), *identity, *identity
-        _, _, is_certain, *products = dr.while_loop(start, runs, body, label="from the center")
-        at_x, at_center = LiftedProduct(*products[:3]), LiftedProduct(*products[3:])
+        start = vector(0), self.backend.Bool(active), *(2 * [no_factors.to_state()])
+        near = self.near.view(cell_sums.near_first, dr.select(active, cell_sums.count, 0))
+        _, is_certain, *products = near.for_each(add, start, "from the center")
+        at_x, at_center = (no_factors.with_state(product) for product in products)
         return at_x.angle() - at_center.angle() + cell_sums.expansion_change, is_certain
 
     def rates_along(
@@ -292,41 +285,31 @@ class CurveCells:
         the far edges, and so at most 3 I3.
         """
         vector, x = self.backend.Array3f, line.x
-        count = dr.select(active, cell_sums.count, 0)
 
-        def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near
-            edges."""
-            return i < count
-
-        def body(i: Any, p: Vec3, field: Vec3, *rates: Real) -> tuple[Any, ...]:
-            """Add the near edges in record i of the cell that `cell_sums` tells; `count` is the
-            number of these records. An edge of the curve adds to `rates`, the bounds along `line`
-            for all `lengths` (`add_edge_rates`). A closing edge adds its Biot and Savart field to
-            `field`.
-
-            p: the vertex before the record.
-
-            Returns the arguments for the next record.
-            """
-            row = self.near.read_record(cell_sums.near_first + i, i < count)
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Add the near edges in the record `row` of the cell. The state holds the vertex before
+            the record; a field, to which a closing edge adds its Biot and Savart field; and the
+            bounds along `line` for all `lengths`, to which an edge of the curve adds
+            (`add_edge_rates`). Returns the new state."""
+            p, field, *rates = state
             for k in range(VERTICES_PER_RECORD):
                 q, inverse = vector(*row[4 * k : 4 * k + 3]), row[4 * k + 3]
                 # inverse > 0 marks edges of the curve, inverse < 0 closing edges.
                 edge = Edge.between(p, q, dr.select(inverse > 0, inverse, 1), x)
-                new_rates = add_edge_rates(line, edge, lengths, rates)
+                new_rates = add_edge_rates(line, edge, lengths, tuple(rates))
                 pairs = zip(new_rates, rates, strict=True)
-                rates = tuple(dr.select(inverse > 0, new, old) for new, old in pairs)
+                rates = [dr.select(inverse > 0, new, old) for new, old in pairs]
                 # The field is the number w times the vector c.
                 w, c = edge.biot_savart()
                 field = field + dr.select(inverse < 0, w * c, 0)
                 p = q
-            return i + 1, p, field, *rates
+            return p, field, *rates
 
         # No edge leads to the first vertex: the vertex before it may be any.
-        start = (self.backend.UInt32(0), vector(0), cell_sums.expansion_gradient)
-        start = (*start, *(self.backend.Float(0) for _ in lengths))
-        _, _, field, *rates = dr.while_loop(start, runs, body, label="near edges along")
+        zeros = (self.backend.Float(0) for _ in lengths)
+        start = vector(0), cell_sums.expansion_gradient, *zeros
+        near = self.near.view(cell_sums.near_first, dr.select(active, cell_sums.count, 0))
+        _, field, *rates = near.for_each(add, start, "near edges along")
         # A bound of |H . v|, with the field H of the proof.
         slope = dr.abs(dr.dot(field, line.v)) + cell_sums.slope_error
         slope = slope + SUM_MARGIN * cell_sums.sums.inverse_squares  # for rounding
@@ -339,7 +322,7 @@ class CurveCells:
             for rate, length in zip(rates, lengths, strict=True)
         )
 
-    def _sum_near(self, x: Vec3, first: Any, count: Any) -> EdgeSums:
+    def _sum_near(self, x: Vec3, first: Any, count: Any) -> CurveSums:
         """Sum over the near loops of a cell at points x (3, n): solid angle, gradient, distance and
         integrals, by the formulas of `edges.sum_over_edges`. Closing edges do not count in the
         distance, in `inverse_cubes` and in `inverse_fourths`, which are about the curve.
@@ -347,24 +330,17 @@ class CurveCells:
         first, count: the index of the cell's first record of near edges, and the number of its
             records.
         """
-        real, index, vector = self.backend.Float, self.backend.UInt32, self.backend.Array3f
+        real, vector = self.backend.Float, self.backend.Array3f
 
-        def runs(i: Any, *_: Any) -> Mask:
-            """Whether the loop goes on, on each lane: its cell has a record number i of near
-            edges."""
-            return i < count
-
-        def body(i: Any, *state: Any) -> tuple[Any, ...]:
-            """Add the edges in record i of the cell to the state. The state holds the product of
+        def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
+            """Add the edges in the record `row` of the cell to the state. It holds the product of
             factors (zr, zi), half the gradient (g), the smallest squared distance (d2), a quarter
             of the first integral and half of the other two. Then, for the last vertex, come its
             position p, the vector a = p - x, |a|, and the number s and the spinor of a
-            (`edges.spinor`). Returns i + 1, and then the new state.
-            """
+            (`edges.spinor`). Returns the new state."""
             zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths, p, a, la, sa, *ca = (
                 state
             )
-            row = self.near.read_record(first + i, i < count)
             # The steps of `edges.sum_over_edges`, on lanes on which an edge leads to q. on_curve:
             # it is an edge of the curve, and not a closing edge.
             for k in range(VERTICES_PER_RECORD):
@@ -388,33 +364,16 @@ class CurveCells:
                 p, a, la, sa, ca = q, b, lb, sb, cb
             scale = dr.rcp(dr.abs(zr) + dr.abs(zi))
             zr, zi = zr * scale, zi * scale
-            return (
-                i + 1,
-                zr,
-                zi,
-                g,
-                d2,
-                inverse_squares,
-                inverse_cubes,
-                inverse_fourths,
-                p,
-                a,
-                la,
-                sa,
-                *ca,
-            )
+            integrals = inverse_squares, inverse_cubes, inverse_fourths
+            return zr, zi, g, d2, *integrals, p, a, la, sa, *ca
 
         # The last vertex is arbitrary at the start, as no edge leads to the first vertex.
         unit, zero = real(1), real(0)
         start = (unit, zero, vector(0), real(dr.inf), zero, zero, zero, vector(0), vector(1), unit,
                  unit, unit, zero, zero, zero)  # fmt: skip
-        sums = dr.while_loop((index(0), *start), runs, body, label="near edges")[1:8]
-        zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = sums
-        angle = 2 * dr.atan2(zi, zr)
+        sums = self.near.view(first, count).for_each(add, start, "near edges")
         # As in `edges.sum_over_edges`, the weights were half of the true ones.
-        return EdgeSums(
-            angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
-        )
+        return CurveSums.of_factors(*sums[:7])
 
 
 def _with_edge(

@@ -7,6 +7,7 @@ cell's center. So the cost of a sample depends only on the number of near primit
 are in unit coordinates, in which the data have a size of about one.
 
 - `DipoleCells`: the cells on a backend.
+- `TreeWithCells`: sums by cells, or by a tree.
 - `build_cells`: builds the cells, one octree level at a time, from the moments of a tree.
 
 Construction. The expansions have degree 6 and are computed from the multipole moments of the nodes
@@ -41,6 +42,7 @@ from harnack.backend.record_table import RecordTable
 from harnack.fmm.dipole_expansion import (
     COEFFICIENTS,
     DEGREE,
+    TRIANGLE_RATIO,
     DipoleExpansions,
     PendingSources,
     source_tree,
@@ -53,13 +55,7 @@ from harnack.fmm.local_expansion import (
 from harnack.fmm.source_sums import SUM_MARGIN, SourceSums
 from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree import NO_PRIMITIVE
-from harnack.tree.octree_lookup import (
-    BALL_MARGIN,
-    MAX_DEPTH,
-    OCTANT_DIRECTIONS,
-    OctreeLookup,
-    encode_nodes,
-)
+from harnack.tree.octree_lookup import BALL_MARGIN, OCTANT_OFFSET, OctreeCells, OctreeLookup
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -199,14 +195,12 @@ class DipoleCells:
             primitive = self.primitives.read_record(
                 dr.gather(index, self.near, first + i, in_list), in_list
             )
-            new_sums, extra_state = add(
-                primitive, in_list, SourceSums.from_state(sums), extra_state
-            )
+            new_sums, extra_state = add(primitive, in_list, far.with_state(sums), extra_state)
             return i + 1, new_sums.to_state(), extra_state
 
         start = (index(0), far.to_state(), extra_state)
         _, state, extra_state = dr.while_loop(start, runs, step, label="near primitives")
-        sums, near_count = SourceSums.from_state(state), self.backend.Float(count)
+        sums, near_count = far.with_state(state), self.backend.Float(count)
         # The rounding of the additions to the gradient: a near primitive of area a is at
         # most `_NEAR` + 1 radii away, so its gradient, of order a/distance^3, is at most its part
         # of s4 times this distance.
@@ -214,29 +208,63 @@ class DipoleCells:
         sums = dataclasses.replace(sums, gradient_truncation=sums.gradient_truncation + added)
         return sums, extra_state, active
 
-    def sums_with_tree(
-        self, tree: Treecode, x: Vec3, detail: Real, add: tuple[AddPrimitive, AddPrimitive],
-        extra_state: tuple[Any, ...], active_lanes: Mask = True,
-    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """Sum over all primitives at points x, with gradients: by the cells where they are accurate
-        enough, and by a tree elsewhere. The cells are used on lanes on which the accuracy scale is
-        at most 1 and x is in the cube.
 
-        tree: a tree over the same primitives.
-        x: (3, n), in unit coordinates.
+@dataclass(frozen=True)
+class TreeWithCells:
+    """A sum over dipoles or triangles (the primitives) on a backend: by FMM cells if there are any,
+    and by a tree elsewhere. All is in unit coordinates, in which the data have a size of about one.
+
+    clusters: the tree with its multipole moments.
+    rounding: a bound of the rounding of the last operations, which turn the sums into the result.
+    cells: FMM cells of the same primitives, with which the cost of a sample depends only on the
+        number of near primitives; None for no cells.
+    """
+
+    clusters: Treecode
+    rounding: Real
+    cells: DipoleCells | None = None
+
+    @property
+    def backend(self) -> Backend:
+        return self.clusters.backend
+
+    @property
+    def coarsest_accuracy(self) -> float:
+        """The smallest accuracy scale that makes a difference: a smaller one gives the same samples
+        (`VariableAccuracy.coarsest`). It is 1 if there are cells, which have a single accuracy."""
+        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
+
+    def sums(
+        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive],
+        extra_state: tuple[Any, ...], active: Mask = True, derivatives: int = 1,
+    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
+        """Sum over all primitives at points x. The cells are used on lanes on which the accuracy
+        scale is at most 1 and x is in their cube, unless second derivatives are requested.
+
+        x: (3, n).
         detail: the accuracy scale; larger is more accurate.
-        add: two functions that add a near primitive (`treecode.AddPrimitive`): the first to the
-            sums of a cell, the second to the sums of the tree.
-        extra_state: a further state of the caller, which `add` updates.
-        active_lanes: the mask of the lanes to compute.
+        adder: a function that makes the function that adds a near primitive
+            (`treecode.AddPrimitive`). Its argument is a number: primitives are near if they are
+            within about so many times their size.
+        extra_state: a further state of the caller, which the made function updates.
+        active: the mask of the lanes to compute.
+        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian. If there are
+            cells, 0 counts as 1.
 
         Returns the sums, and the new state of the caller.
         """
-        in_cell, in_tree = add
-        # Scales below 1 mean the same as 1, the accuracy of cells, also where the tree is used.
-        lanes, tree_detail = self.backend.Bool(active_lanes), fmax(detail, self.backend.Float(1))
-        sums, state, is_valid = self.sums(x, lanes & (detail <= 1), in_cell, extra_state)
-        tree_sums, tree_state = tree.sums(x, tree_detail, in_tree, extra_state, lanes & ~is_valid)
+        if self.cells is None or derivatives == 2:
+            add = adder(self.clusters.acceptance_ratio(detail))
+            return self.clusters.sums(x, detail, add, extra_state, active, derivatives=derivatives)
+        # The tree is at least as accurate as the cells: x may be outside of the cube at a smaller
+        # scale.
+        lanes, tree_detail = self.backend.Bool(active), fmax(detail, self.backend.Float(1))
+        in_cell = adder(self.backend.Float(TRIANGLE_RATIO))
+        in_tree = adder(self.clusters.acceptance_ratio(tree_detail))
+        sums, state, is_valid = self.cells.sums(x, lanes & (detail <= 1), in_cell, extra_state)
+        tree_sums, tree_state = self.clusters.sums(
+            x, tree_detail, in_tree, extra_state, lanes & ~is_valid
+        )
         pairs = zip(state, tree_state, strict=True)
         state = tuple(dr.select(is_valid, ours, theirs) for ours, theirs in pairs)
         return sums.select(~is_valid, tree_sums), state
@@ -262,20 +290,16 @@ def _truncation_at(
 
 
 @dataclass(frozen=True)
-class _CellLevel:
-    """The cells at one depth of the octree, which all have the same size.
+class _CountedCells(OctreeCells):
+    """The cells at one depth of the octree, with the numbers of their near primitives.
 
-    centers: (n, 3) centers of the cells.
-    radius: the radius of their balls.
     is_leaf: (n,) whether a cell is not split.
     near: (n,) the number of near primitives of each cell. For a cell that is split it is only a
         number above the limit, as counting stops there.
     """
 
-    centers: FloatArray
-    radius: float
-    is_leaf: BoolArray
-    near: IntArray
+    is_leaf: BoolArray = dataclasses.field(kw_only=True)
+    near: IntArray = dataclasses.field(kw_only=True)
 
 
 def build_cells(
@@ -312,23 +336,24 @@ def build_cells(
     if finer:
         start_near = int(_FINER_FRACTION * start_near)
     if packed.primitives.packets_per_record > 1:  # triangles; the record of a dipole is one packet
-        limit = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
-        max_near = max(_MOST_NEAR, min(_MAX_NEAR, limit))
-    octree = _octree_within_memory(packed, half, backend, (start_near, max_near), most_bytes)
-    if octree is None:
-        return None
-    double, shifts = (
-        packed.backend,
-        local_to_local_matrices(DEGREE, 0.5 / (math.sqrt(3) * BALL_MARGIN)),
-    )
+        fraction = int(_MAX_NEAR_FRACTION * (tree.leaf_slots != NO_PRIMITIVE).sum())
+        max_near = max(_MOST_NEAR, min(_MAX_NEAR, fraction))
+    # Cells are split if they have more near primitives than a limit, which is doubled until they
+    # take little enough memory. Beyond `max_near`, lists of near primitives take nearly as much
+    # memory, whatever the size of the cells.
+    limit = start_near
+    while (octree := _octree(packed, half, limit, backend, most_bytes)) is None:
+        if limit >= max_near:
+            return None
+        limit = min(2 * limit, max_near)
+    double, shifts = packed.backend, local_to_local_matrices(DEGREE, OCTANT_OFFSET)
     sources, parents = (
         PendingSources.of_root(double),
         _ParentExpansions(DipoleExpansions.zero(1), shifts, 0.0),
     )
-    nodes: list[IntArray] = []
     tables: list[npt.NDArray[Any]] = []
     near: list[npt.NDArray[Any]] = []
-    split_count, leaf_count, near_count = 0, 0, 0
+    near_count = 0
     # Each pass adds the cells of one depth: first the cells that are not split, then the others.
     # `sources` has the sources that are left to each cell of this depth, `parents` the expansions
     # that they inherit. With the negative radius `none_stay`, `split_far` replaces every near node
@@ -347,8 +372,6 @@ def build_cells(
             tables.append(table.astype(backend.dtype))
             near.append(to_numpy(nearby.primitives.entries)[: int(lengths.sum())])
             near_count += int(lengths.sum())
-        nodes.append(encode_nodes(level.is_leaf, leaf_count, split_count))
-        leaf_count, split_count = leaf_count + len(leaves), split_count + len(split)
         # A cell that is split hands its expansion and its remaining sources to its eight octants.
         split_sums: list[DipoleExpansions] = []
         pending: list[PendingSources] = []
@@ -367,11 +390,12 @@ def build_cells(
                 double, np.repeat(np.arange(len(split)), 8)
             )
     table, entries = np.concatenate(tables), np.concatenate(near)
+    levels_of_leaves = [level.is_leaf for level in octree]
     return DipoleCells(
-        backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, nodes),
+        backend, OctreeLookup.from_levels(backend, np.full(3, -half), 2 * half, levels_of_leaves),
         RecordTable.upload(backend, table),
         upload_integers(backend, entries if len(entries) else np.zeros(1, np.uint32)), primitives,
-        leaf_count, _bytes(backend, octree),
+        len(table), _bytes(backend, octree),
     )  # fmt: skip
 
 
@@ -440,79 +464,46 @@ def _cell_records(
     return np.column_stack([*head, sums.coefficients])
 
 
-def _octree_within_memory(
-    packed: PackedTree, half_side: float, backend: Backend, limits: tuple[int, int], most_bytes: int
-) -> list[_CellLevel] | None:
-    """Choose the cells of the cube [-half_side, half_side]^3 so that they take at most `most_bytes`
-    bytes. A cell is split if it has more near primitives than a limit. Limits are tried in turn,
-    each one twice the previous one, until the cells are small enough.
-
-    packed: the tree of the primitives.
-    limits: the first limit to try, and the largest limit. Beyond the largest limit, lists of near
-        primitives take nearly as much memory, whatever the size of the cells.
-
-    Returns one entry for each depth of the octree; or None if the cells take too much memory even
-    with the largest limit.
-    """
-
-    def is_too_large(levels: list[_CellLevel]) -> bool:
-        """Whether cells take more than `most_bytes` bytes. levels: the cells of each depth."""
-        return _bytes(backend, levels) > most_bytes
-
-    limit, max_near = limits
-    # Double the limit until the cells are small enough in memory.
-    while (octree := _octree(packed, half_side, limit, is_too_large)) is None and limit < max_near:
-        limit = min(2 * limit, max_near)
-    return octree
-
-
 def _octree(
-    packed: PackedTree,
-    half_side: float,
-    max_near: int,
-    is_too_large: Callable[[list[_CellLevel]], bool],
-) -> list[_CellLevel] | None:
+    packed: PackedTree, half_side: float, max_near: int, backend: Backend, most_bytes: int
+) -> list[_CountedCells] | None:
     """Divide the cube [-half_side, half_side]^3 into the cells of an octree. A cell is split if too
     many primitives are near to it, that is, within `_NEAR` radii of its ball from its center. Cells
-    at the depth `MAX_DEPTH` are not split in any case.
+    of the greatest depth are not split in any case.
 
     packed: the tree of the primitives.
     max_near: a cell is split if it has more near primitives than this.
-    is_too_large: a function that says whether the cells so far take too much memory.
+    backend: the backend of the finished cells.
+    most_bytes: the number of bytes that they may take.
 
-    Returns one entry for each depth of the octree, or None if the cells take too much memory.
+    Returns one entry for each depth of the octree, or None if the cells take more memory.
     """
-    backend = packed.backend
-    root = PendingSources.of_root(backend)
-    levels: list[_CellLevel] = []
-    centers = np.zeros((1, 3))
-    while len(centers):
-        cell_half_side = half_side / 2 ** len(levels)
-        radius = math.sqrt(3) * cell_half_side * BALL_MARGIN
-        is_last = len(levels) == MAX_DEPTH
+    double = packed.backend
+    root = PendingSources.of_root(double)
+    levels: list[_CountedCells] = []
+    cells = OctreeCells(np.zeros((1, 3)), half_side)
+    while len(cells.centers):
         # Counting stops above the limit; cells of the last depth need the exact number. With the
         # negative radius `none_stay`, near nodes are replaced by their primitives.
-        limit = dr.opaque(backend.UInt32, _UNLIMITED if is_last else max_near)
-        near, none_stay = (dr.opaque(backend.Float, _NEAR * radius), dr.opaque(backend.Float, -1.0))
+        limit = dr.opaque(double.UInt32, _UNLIMITED if cells.is_last else max_near)
+        near, none_stay = (dr.opaque(double.Float, length) for length in (_NEAR * cells.radius, -1))
         # Each cell searches the whole tree for its near primitives.
         roots, c = (
-            root.subset(backend, np.zeros(len(centers), np.int64)),
-            to_vector3(backend, centers),
+            root.subset(double, np.zeros(len(cells.centers), np.int64)),
+            to_vector3(double, cells.centers),
         )
         # None: primitives are counted, and not stored.
         counts = roots.primitives_of(packed, c, near, none_stay, None, far=False, count_limit=limit)
         count = to_numpy(counts).astype(np.int64)
-        is_leaf = np.broadcast_to(count <= max_near, len(centers)) | is_last
-        levels.append(_CellLevel(centers, radius, is_leaf, count))
-        if is_too_large(levels):
+        is_leaf = np.broadcast_to(count <= max_near, len(cells.centers)) | cells.is_last
+        levels.append(_CountedCells(**vars(cells), is_leaf=is_leaf, near=count))
+        if _bytes(backend, levels) > most_bytes:
             return None
-        centers = (centers[~is_leaf][:, None] + 0.5 * cell_half_side * OCTANT_DIRECTIONS).reshape(
-            -1, 3
-        )
+        cells = cells.octants(~is_leaf)
     return levels
 
 
-def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
+def _bytes(backend: Backend, levels: list[_CountedCells]) -> int:
     """Compute the number of bytes that cells take: their records, their lists of near primitives,
     and the octree's nodes.
 
@@ -524,7 +515,6 @@ def _bytes(backend: Backend, levels: list[_CellLevel]) -> int:
         leaves += int(level.is_leaf.sum())
         near += int(level.near[level.is_leaf].sum())
     nodes = sum(len(level.is_leaf) for level in levels)
-    # A record takes a multiple of eight numbers.
-    record = 8 * -(-(_HEADER_SIZE + COEFFICIENTS) // 8) * np.dtype(backend.dtype).itemsize
+    records = RecordTable.memory_bytes(backend, leaves, _HEADER_SIZE + COEFFICIENTS)
     # The index of a near primitive takes four bytes.
-    return record * leaves + 4 * near + OctreeLookup.memory_bytes(nodes)
+    return records + 4 * near + OctreeLookup.memory_bytes(nodes)

@@ -29,7 +29,7 @@ import numpy as np
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.record_table import RecordTable
 from harnack.fmm.edges import Edge, edge_variation, single_edges
-from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, SymmetricMatrix
 from harnack.fmm.source_sums import SourceSums, SourceTerm
 from harnack.fmm.unit_frame import coordinate_rounding
 from harnack.tree.triangle_tree import VerticalRayFrame, edge_function
@@ -222,52 +222,22 @@ class LiftedEdge:
         )
         return rounding, 0.5 * half_integral, 0.375 * dr.rcp(distance) * half_integral
 
-
-@dataclass(frozen=True)
-class LiftedSums:
-    """Sums at a point over boundary edges, and possibly over other sources. The value is a sum of
-    solid angles Omega_e of the edges. They are kept as a product of complex factors F_e, whose
-    argument is half the sum, and are added to the value at the end (`total`).
-
-    sums: the value without the angles of edges; the derivatives; and all bounds.
-    product: the product of the factors F_e of the edges.
-    """
-
-    sums: SourceSums
-    product: LiftedProduct
-
-    @classmethod
-    def zero(cls, backend: Backend, derivatives: int) -> LiftedSums:
-        """Make the sums over no edges, to which edges can be added. derivatives: 0 for the value
-        only, 1 with the gradient, 2 with the Hessian."""
-        return cls(
-            SourceSums.zero(backend, dr.inf, derivatives), LiftedProduct.identity(backend.Float)
-        )
-
-    @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> LiftedSums:
-        """Make the sums from the state of a recorded loop, as the method `parts` returns it."""
-        return cls(SourceSums.from_state(parts[0]), LiftedProduct(*parts[1]))
-
-    def parts(self) -> tuple[Any, ...]:
-        """List the numbers of the sums and of the product as nested tuples, for the state of a
-        recorded loop."""
-        return self.sums.to_state(), self.product.parts()
-
-    def add_edge(self, edge: LiftedEdge, unit: Real, active: Mask) -> LiftedSums:
-        """Add an edge on active lanes, and return the new sums. On other lanes they stay as they
-        are.
+    def add_to(
+        self, sums: SourceSums, product: LiftedProduct, unit: Real, active: Mask
+    ) -> tuple[SourceSums, LiftedProduct]:
+        """Add the edge on active lanes to sums and to a product of factors of edges, and return
+        both. On other lanes they stay as they are. The solid angle of the edge is in the product
+        and not in the sums (`LiftedProduct.add_angle_to`).
 
         unit: a bound of the rounding of a coordinate.
         """
-        (re, im), terms = edge.factor(), edge.terms(self.sums.derivatives, active)
         # On other lanes the terms are 0.
-        sums = self.sums.add_term(terms, True)
-        rounding, s4, s5 = edge.bounds(unit)
+        (re, im), terms = self.factor(), self.terms(sums.derivatives, active)
+        sums = sums.add_term(terms, True)
+        rounding, s4, s5 = self.bounds(unit)
         # On other lanes the product is multiplied by 1; scaling it again may round it.
         rounding = dr.select(active, rounding, 2 * float(dr.epsilon(rounding)))
-        # edge.edge: the positions of the ends relative to the point.
-        distance = fmin(dr.sqrt(edge.edge.squared_distance), sums.singularity_distance)
+        distance = fmin(dr.sqrt(self.edge.squared_distance), sums.singularity_distance)
         sums = dataclasses.replace(
             sums,
             rounding=sums.rounding + rounding,
@@ -275,20 +245,10 @@ class LiftedSums:
             s4=sums.s4 + dr.select(active, s4, 0),
             s5=sums.s5 + dr.select(active, s5, 0),
         )
-        factor = dr.select(active, re, 1), dr.select(active, im, 0)
-        return LiftedSums(sums, self.product.times(*factor))
-
-    @property
-    def angle(self) -> Real:
-        """The sum of the solid angles Omega_e of all edges added so far, a real number."""
-        return self.product.angle()
-
-    def total(self) -> SourceSums:
-        """Complete the sums: add the solid angles of the edges to the value."""
-        return self.sums.add_term(SourceTerm(self.angle), True)
+        return sums, product.times(dr.select(active, re, 1), dr.select(active, im, 0))
 
 
-def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
+def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     """Sum over all edges at points x (3, n), in one loop: the lifted solid angle for rays in the
     direction d = z, its derivatives, and bounds of errors and remainder.
 
@@ -297,17 +257,24 @@ def lifted_sums(edges: LiftedEdges, x: Vec3, derivatives: int) -> LiftedSums:
     """
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
+    # dr.inf: the distance of the nearest edge before any is added.
+    no_sums = SourceSums.zero(backend, dr.inf, derivatives)
+    no_factors = LiftedProduct.identity(backend.Float)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Add the edge in the record `row` to the sums, whose `parts` are the state. Returns the
-        new state."""
+        """Add the edge in the record `row` to the state, which is that of the sums without angles,
+        and of the product of the edges' factors. Returns the new state. `unit` bounds the rounding
+        of a coordinate."""
         p, q = vector(*row[:3]), vector(*row[4:7])
         # Padding has the direction row[3] = 0 and is not active.
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
-        return LiftedSums.of(state).add_edge(edge, unit, row[3] != 0).parts()
+        sums, product = no_sums.with_state(state[0]), no_factors.with_state(state[1])
+        sums, product = edge.add_to(sums, product, unit, row[3] != 0)
+        return sums.to_state(), product.to_state()
 
-    start = LiftedSums.zero(backend, derivatives).parts()
-    return LiftedSums.of(edges.records.for_each(add, start, "lift"))
+    start = no_sums.to_state(), no_factors.to_state()
+    sums, product = edges.records.for_each(add, start, "lift")
+    return no_factors.with_state(product).add_angle_to(no_sums.with_state(sums))
 
 
 def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
@@ -320,6 +287,8 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
     """
     backend, unit = edges.records.backend, coordinate_rounding(x)
     vector = backend.Array3f
+    # dr.inf: the distance of the nearest edge before any is added.
+    no_sums = SourceSums.zero(backend, dr.inf, derivatives)
 
     def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
         """Add the edge in the record `row` to the sums, given as a state (`SourceSums.to_state`). A
@@ -328,14 +297,12 @@ def edge_rates(edges: LiftedEdges, x: Vec3, derivatives: int) -> SourceSums:
         p, q, active = vector(*row[:3]), vector(*row[4:7]), row[3] != 0
         edge = LiftedEdge.between(p, q, row[3], row[7], VerticalRayFrame(x), x)
         # On other lanes the terms are 0.
-        sums = SourceSums.from_state(state).add_term(edge.terms(derivatives, active), True)
+        sums = no_sums.with_state(state).add_term(edge.terms(derivatives, active), True)
         _, s4, s5 = edge.bounds(unit)
         s4, s5 = (dr.select(active, bound, 0) for bound in (s4, s5))
         return dataclasses.replace(sums, s4=sums.s4 + s4, s5=sums.s5 + s5).to_state()
 
-    # dr.inf: the distance of the nearest edge before any is added.
-    start = SourceSums.zero(backend, dr.inf, derivatives).to_state()
-    return SourceSums.from_state(edges.records.for_each(add, start, "rates of edges"))
+    return no_sums.with_state(edges.records.for_each(add, no_sums.to_state(), "rates of edges"))
 
 
 @dataclass(frozen=True)
@@ -434,7 +401,7 @@ def _length_less_axial(a: Vec3, length: Real) -> Real:
 
 
 @dataclass(frozen=True)
-class LiftedProduct:
+class LiftedProduct(LoopRecord):
     """A product of the complex factors of edges, together with the sum of their arguments, which is
     a real number and not only known modulo 2 pi. The product is scaled to a length of about 1.
 
@@ -451,10 +418,6 @@ class LiftedProduct:
     def identity(cls, real: Any) -> LiftedProduct:
         """Make the product of no factors, which is 1. real: the type of its numbers."""
         return cls(real(1), real(0), real(0))
-
-    def parts(self) -> tuple[Real, Real, Real]:
-        """List the attributes re, im and turns, for the state of a recorded loop."""
-        return self.re, self.im, self.turns
 
     def times(self, re: Real, im: Real) -> LiftedProduct:
         """Multiply by a further factor re + i im, and return the new product. If the product is 0
@@ -486,3 +449,7 @@ class LiftedProduct:
         """Compute twice the sum of the factors' arguments, which is the sum of the edges' solid
         angles."""
         return 2 * dr.fma(2 * dr.pi, self.turns, dr.atan2(self.im, self.re))
+
+    def add_angle_to(self, sums: SourceSums) -> SourceSums:
+        """Add the sum of the edges' solid angles to the value of `sums`."""
+        return sums.add_term(SourceTerm(self.angle()), True)

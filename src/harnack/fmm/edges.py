@@ -188,7 +188,7 @@ def vertex_rounding(epsilon: float, x: Vec3, inverse_squares: Real) -> Real:
     epsilon: the machine epsilon of the backend.
     x: the point in unit coordinates (the curve lies within a distance of 1 of the origin).
     inverse_squares: an upper bound of the integral of |dp|/D^2 along the curve, with D the distance
-        from x to the point p (`EdgeSums.inverse_squares`).
+        from x to the point p (`CurveSums.inverse_squares`).
     """
     return epsilon * dr.fma(2.25, dr.norm(x), 2.9 + 2.25) * inverse_squares
 
@@ -367,14 +367,14 @@ _RENORMALIZE_EVERY = 2
 
 
 @dataclass(frozen=True)
-class EdgeSums:
-    """Quantities of a closed curve at a point x, summed over its edges.
+class CurveSums:
+    """Sums over a closed curve at a point x, from which its solid angle and proved bounds of it are
+    computed. D is the distance from x to the point p of the curve.
 
-    angle, gradient: the solid angle of the curve in (-2 pi, 2 pi], and its gradient.
-    distance: the distance to the nearest edge.
-    inverse_squares, inverse_cubes, inverse_fourths: integrals of |dp|/D^k along the edges, with D
-        the distance from x to p: an upper bound for k = 2, the integral for k = 3, and an upper
-        bound for k = 4.
+    angle, gradient: the solid angle, modulo 4 pi, and its gradient.
+    distance: the distance from x to the curve, or a lower bound of it.
+    inverse_squares, inverse_cubes, inverse_fourths: the integrals of |dp|/D^k along the curve for k
+        = 2, 3 and 4, or upper bounds of them.
     """
 
     angle: Real
@@ -384,10 +384,42 @@ class EdgeSums:
     inverse_cubes: Real
     inverse_fourths: Real
 
+    @classmethod
+    def of_factors(
+        cls, zr: Real, zi: Real, half_gradient: Vec3, square: Real, quarter: Real, *halves: Real
+    ) -> CurveSums:
+        """The sums over edges, from what a loop over the edges adds up.
 
-def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
-    """Sum over all edges of a curve at points x: its solid angle Omega, the gradient, the distance
-    to the nearest edge, and three integrals along the curve.
+        zr, zi: the product of the edges' factors, whose argument is half the solid angle.
+        half_gradient: half the gradient.
+        square: the smallest squared distance.
+        quarter, halves: a quarter of `inverse_squares`, and half of the other two integrals.
+        """
+        angle, gradient = 2 * dr.atan2(zi, zr), 2 * half_gradient
+        return cls(angle, gradient, dr.sqrt(square), 4 * quarter, *(2 * half for half in halves))
+
+    def plus(self, other: CurveSums) -> CurveSums:
+        """The sums over two curves together: this one, and that of `other`."""
+        return CurveSums(
+            self.angle + other.angle,
+            self.gradient + other.gradient,
+            fmin(self.distance, other.distance),
+            self.inverse_squares + other.inverse_squares,
+            self.inverse_cubes + other.inverse_cubes,
+            self.inverse_fourths + other.inverse_fourths,
+        )
+
+    def select(self, mask: Mask, other: CurveSums) -> CurveSums:
+        """The sums `other` on the lanes on which the mask is true, and these sums on all other
+        lanes."""
+        pairs = zip(vars(other).values(), vars(self).values(), strict=True)
+        return CurveSums(*(dr.select(mask, theirs, ours) for theirs, ours in pairs))
+
+
+def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> CurveSums:
+    """Sum over all edges of a curve at points x: its solid angle Omega in (-2 pi, 2 pi], the
+    gradient, the distance to the nearest edge, and integrals along the curve (`CurveSums`): an
+    upper bound for k = 2, the integral for k = 3, and an upper bound for k = 4.
 
     x: (3, n), in unit coordinates.
     active: the mask of the lanes to compute.
@@ -457,14 +489,8 @@ def sum_over_edges(edges: LoopEdges, x: Vec3, active: Mask = True) -> EdgeSums:
         return zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths
 
     start = (real(1), real(0), type(x)(0), real(dr.inf), real(0), real(0), real(0))
-    zr, zi, g, d2, inverse_squares, inverse_cubes, inverse_fourths = edges.records.for_each(
-        add, start, "edges", active
-    )
-    angle = 2 * dr.atan2(zi, zr)
     # The weights are half of the true ones; the bound for k = 2 has another factor of 2.
-    return EdgeSums(
-        angle, 2 * g, dr.sqrt(d2), 4 * inverse_squares, 2 * inverse_cubes, 2 * inverse_fourths
-    )
+    return CurveSums.of_factors(*edges.records.for_each(add, start, "edges", active))
 
 
 def hessian_over_edges(edges: LoopEdges, x: Vec3) -> tuple[Vec3, Vec3, Vec3]:

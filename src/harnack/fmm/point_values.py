@@ -15,6 +15,8 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.elementary import fmax
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Real, Vec3
 
 # A bound of the rounding of the sums of dipoles' moments, as a fraction of the total weight. The
@@ -22,8 +24,28 @@ if TYPE_CHECKING:
 _MOMENT_ROUNDING = 32 * 2.0**-53
 
 
+class LoopRecord:
+    """A frozen dataclass of numbers that a recorded loop updates. The state of such a loop consists
+    of tuples, so that records are converted to tuples and back."""
+
+    def to_state(self) -> tuple[Any, ...]:
+        """The attributes in the order of the constructor, as a tuple; an attribute that is such a
+        record becomes a tuple, too. Sums that were not requested are None, and not arrays of zeros:
+        Dr.Jit records a loop a second time if an array of its state never changes."""
+        values = vars(self).values()
+        return tuple(one.to_state() if isinstance(one, LoopRecord) else one for one in values)
+
+    def with_state(self, state: tuple[Any, ...]) -> Self:
+        """The record of the same structure as this one that `to_state` turned into `state`."""
+        pairs = zip(vars(self).values(), state, strict=True)
+        attributes = (
+            old.with_state(new) if isinstance(old, LoopRecord) else new for old, new in pairs
+        )
+        return type(self)(*attributes)
+
+
 @dataclass(frozen=True)
-class SymmetricMatrix:
+class SymmetricMatrix(LoopRecord):
     """A symmetric 3 x 3 matrix in each lane, as a record of its six entries xx, yy, zz, xy, xz, yz.
     Loops that add up such matrices (Hessians) keep it in their state."""
 

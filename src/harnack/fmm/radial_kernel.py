@@ -29,10 +29,11 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.backend.elementary import fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import TaylorRemainder
-from harnack.fmm.point_values import SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, PointValues, SymmetricMatrix
 from harnack.fmm.source_sums import SUM_MARGIN, SourceSums, SourceTerm
+from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -111,7 +112,7 @@ class PolynomialTerm:
 
 
 @dataclass(frozen=True)
-class RadialSums:
+class RadialSums(LoopRecord):
     """Sums over all dipoles i at a point x: the value f, its derivatives, and sums from which
     bounds near x are computed. w_i = |m_i| is the weight of a dipole and d_i its distance from x.
     For a cluster, bounds of the sums over its dipoles are added. The numbers Q_2 and Q_3 bound
@@ -132,15 +133,6 @@ class RadialSums:
         only, 1 with the gradient, 2 with the Hessian."""
         zero = backend.Float(0)
         return cls(SourceSums.zero(backend, dr.inf, derivatives), zero, zero)
-
-    @classmethod
-    def of(cls, parts: tuple[Any, ...]) -> RadialSums:
-        """The sums from the state of a loop, as the method `parts` returns it."""
-        return cls(SourceSums.from_state(parts[0]), *parts[1:])
-
-    def parts(self) -> tuple[Any, ...]:
-        """The numbers of `sums`, q2_d3 and q2_d4, as a tuple for the state of a recorded loop."""
-        return self.sums.to_state(), self.q2_d3, self.q2_d4
 
     def plus(self, source: SourceAtPoint, rounding: Real, active: Mask) -> RadialSums:
         """The sums with a further dipole or cluster, `source`, added on active lanes.
@@ -178,6 +170,18 @@ class RadialSums:
             s5=sums.s5 + q3_d5,
         )
         return RadialSums(sums, self.q2_d3 + q2_d3, self.q2_d4 + q2_d4)
+
+    def values(self, x: Vec3) -> PointValues:
+        """The value at the points x of these sums, and those of its derivatives that were summed,
+        with error bounds."""
+        rounding = 16 * float(dr.epsilon(self.q2_d3)) * dr.abs(self.sums.value)
+        return self.sums.values(1.0, coordinate_rounding(x), rounding)
+
+    @property
+    def least_distance(self) -> Real:
+        """A lower bound of the distance to the nearest dipole, also after rounding."""
+        distance = self.sums.singularity_distance * (1 - SUM_MARGIN)
+        return fmax(distance - 16 * float(dr.epsilon(self.q2_d3)), 0)
 
     def remainder(self, share: float, r: Real, growth: Real) -> Real:
         """A bound of |f(y) - f(x) - grad f.(y-x)|/|y-x|^2 for |y-x| <= r.

@@ -115,17 +115,11 @@ class RadialSum(abc.ABC):
             Larger is more accurate.
         """
 
-    def _with_dipole(
-        self, row: list[Real], x: Vec3, derivatives: int, state: tuple[Any, ...]
-    ) -> tuple[Any, ...]:
-        """Add the dipole in the record `row` to the sums at points x. state: the parts of the sums
-        in a loop (`RadialSums.parts`). Returns the new state.
-
-        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-        """
-        dipole = dipole_source(row, x, self.kernel, derivatives)
+    def _with_dipole(self, sums: RadialSums, row: list[Real], x: Vec3) -> RadialSums:
+        """Add the dipole in the record `row` to the sums at points x, and return the new sums."""
+        dipole = dipole_source(row, x, self.kernel, sums.sums.derivatives)
         # self.rounding: the rounding of a term, as a fraction; True: on all lanes.
-        return RadialSums.of(state).plus(dipole, self.rounding, True).parts()
+        return sums.plus(dipole, self.rounding, True)
 
 
 class DirectSum(RadialSum):
@@ -140,14 +134,13 @@ class DirectSum(RadialSum):
         """Add the terms of all dipoles at points x to `sums`. Returns the new sums; `closer` has no
         effect."""
         del closer
-        derivatives = sums.sums.derivatives
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the dipole in the record `row` to the sums, whose `parts` are the state. Returns
-            the new state."""
-            return self._with_dipole(row, x, derivatives, state)
+            """Add the dipole in the record `row` to the sums, given as a state. Returns the new
+            state."""
+            return self._with_dipole(sums.with_state(state), row, x).to_state()
 
-        return RadialSums.of(self._records.for_each(add, sums.parts(), "radial dipoles"))
+        return sums.with_state(self._records.for_each(add, sums.to_state(), "radial dipoles"))
 
 
 class RadialTreecode(RadialSum):
@@ -179,27 +172,27 @@ class RadialTreecode(RadialSum):
         derivatives = sums.sums.derivatives
 
         def near(row: list[Real], active: Mask, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the dipole in the record `row` to the sums, whose `parts` are the state. Its leaf
-            is not far from x on active lanes. Returns the new state."""
+            """Add the dipole in the record `row` to the sums, given as a state. Its leaf is not far
+            from x on active lanes. Returns the new state."""
             # Lanes on which the leaf is far do not take part in the loop over its dipoles.
             del active
-            return self._with_dipole(row, x, derivatives, state)
+            return self._with_dipole(sums.with_state(state), row, x).to_state()
 
         def far(node: ClusterView, state: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Add the cluster `node` to the sums, whose `parts` are the state, on lanes on which it
-            is far. Returns the new state."""
+            """Add the cluster `node` to the sums, given as a state, on lanes on which it is far.
+            Returns the new state."""
             length = dr.sqrt(node.square)
             # node.r leads from the center of the cluster to x; z leads back.
             cluster = cluster_source(
                 node.head, node.payload, -node.r, length, self.kernel, derivatives
             )
-            return RadialSums.of(state).plus(cluster, self.rounding, node.far).parts()
+            return sums.with_state(state).plus(cluster, self.rounding, node.far).to_state()
 
         height = self.kernel.height_square
         total = traverse_clusters(
-            self._tree, x, closer, far, near, sums.parts(), height_square=height
+            self._tree, x, closer, far, near, sums.to_state(), height_square=height
         )
-        return RadialSums.of(total)
+        return sums.with_state(total)
 
 
 def cluster_source(

@@ -21,14 +21,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.enclosures.samples import Sample
-from harnack.fmm.point_values import PointValues, SymmetricMatrix
+from harnack.fmm.point_values import LoopRecord, PointValues, SymmetricMatrix
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -120,7 +120,7 @@ class SourceTerm:
 
 
 @dataclass(frozen=True)
-class SourceSums:
+class SourceSums(LoopRecord):
     """The sums over all sources (dipoles, edges and far nodes of a tree) at points x, one point in
     each lane: f, its derivatives, error bounds, and the numbers from which bounds of f near x
     follow. These numbers are the distance to the nearest singular point (a dipole or a point of an
@@ -177,26 +177,6 @@ class SourceSums:
         bounds = zero, zero, hessian_truncation, zero, real(free_distance), zero, zero, zero
         return cls(zero, gradient, hessian, *bounds)
 
-    @classmethod
-    def from_state(cls, parts: tuple[Any, ...]) -> SourceSums:
-        """The sums that `to_state` turned into this tuple.
-
-        parts: the attributes in the order of the constructor; the Hessian is a tuple of its six
-            entries, or None.
-        """
-        total, gradient, hessian, *bounds = parts
-        return cls(total, gradient, None if hessian is None else SymmetricMatrix(*hessian), *bounds)
-
-    def to_state(self) -> tuple[Any, ...]:
-        """The attributes in the order of the constructor, as a tuple for the state of a recorded
-        loop. The Hessian becomes a tuple of its six entries. Sums that were not requested are None,
-        and not arrays of zeros: Dr.Jit records a loop a second time if an array of its state never
-        changes."""
-        hessian = None if self.hessian is None else self.hessian.components()
-        bounds = self.truncation, self.gradient_truncation, self.hessian_truncation, self.rounding
-        ends = self.singularity_distance, self.s4, self.s5, self.compensation
-        return self.total, self.gradient, hessian, *bounds, *ends
-
     def select(self, mask: Mask, other: SourceSums) -> SourceSums:
         """The sums `other` on the lanes on which the mask is true, and these sums on all other
         lanes. Neither of the two may have a Hessian."""
@@ -208,6 +188,13 @@ class SourceSums:
     def derivatives(self) -> int:
         """The order up to which derivatives are summed: 0, 1 or 2."""
         return 0 if self.gradient is None else 1 if self.hessian is None else 2
+
+    def gradient_error(self, unit: Real) -> Real:
+        """A bound of the error of the gradient, by truncation and by the rounding of positions.
+
+        unit: a bound of the rounding error of a coordinate.
+        """
+        return dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
 
     def add_term(self, terms: SourceTerm, active: Mask) -> SourceSums:
         """These sums plus the contribution of one more source, on the active lanes. A derivative
@@ -355,7 +342,7 @@ class SourceSums:
         1/coarse_ratio times the distance of the center, and `max_step_fraction` is less than that.
         """
         g = share * self.gradient
-        slope_error = share * dr.fma(SLOPE_ROUNDINGS * unit, self.s4, self.gradient_truncation)
+        slope_error = share * self.gradient_error(unit)
         # The distance to the nearest singular point, reduced for rounding.
         distance = self.singularity_distance * (1 - SUM_MARGIN) - 4 * unit
         # A TaylorRemainder bounds the second derivative, so its constant is twice that of t^2.

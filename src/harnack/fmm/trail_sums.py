@@ -622,6 +622,7 @@ class LiftedTrails:
         real, unit = backend.Float, fmax(coordinate_rounding(frame.o), coordinate_rounding(x))
         factor_rounding = 0.5 * backend.machine_epsilon * FACTOR_ROUNDINGS * self.edges_per_record
         steep_rounding = 0.5 * backend.machine_epsilon * STEEP_ROUNDINGS
+        no_factors = LiftedProduct.identity(real)
 
         def add(row: list[Real], state: tuple[Any, ...]) -> tuple[Any, ...]:
             """The new state, after the edges in the record `row` have been added. It holds the
@@ -632,7 +633,7 @@ class LiftedTrails:
             # record's factors, and `unit` that of a coordinate; `steep_rounding` is STEEP_ROUNDINGS
             # unit roundoffs.
             product, g, min_square, rounding, s4, s5 = state
-            product = LiftedProduct(*product)
+            product = no_factors.with_state(product)
             a = view_vertex(self._vertex(row, 0), frame, x)
             total, weighted, nearest, longest = (real(0), real(0), real(dr.inf), real(0))
             # Over the edges of the record, total is the sum of L w, weighted the sum of d^2 L w,
@@ -664,17 +665,23 @@ class LiftedTrails:
             rounding = rounding + (steep + factor_rounding)
             # s4 grows by the sum of L w/4, and s5 by that of 3 L w/(16 d), 3/16 being 0.1875.
             s5 = dr.fma(0.1875 * total, dr.rcp(distance), s5)
-            return (product.parts(), g, fmin(nearest, min_square), rounding, s4 + 0.25 * total, s5)
+            return (
+                product.to_state(),
+                g,
+                fmin(nearest, min_square),
+                rounding,
+                s4 + 0.25 * total,
+                s5,
+            )
 
-        identity = LiftedProduct.identity(real).parts()
-        start = (identity, backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
+        start = (no_factors.to_state(), backend.Array3f(0), real(dr.inf), real(0), real(0), real(0))
         product, g, min_square, rounding, s4, s5 = self.records.for_each(
             add, start, "trails along", active
         )
         sums = SourceSums.zero(backend, dr.inf, 1)
         return dataclasses.replace(
             sums,
-            total=LiftedProduct(*product).angle(),
+            total=no_factors.with_state(product).angle(),
             gradient=g,
             rounding=rounding,
             singularity_distance=dr.sqrt(min_square),

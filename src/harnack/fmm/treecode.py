@@ -418,6 +418,9 @@ class Treecode:
             self.acceptance_ratio(detail) / self.coarse_ratio,
         )
         unit = coordinate_rounding(x)
+        # The distance that is taken to be free of sources if no node bounds it.
+        no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
+        no_sums = SourceSums.zero(self.backend, no_source, derivatives)
 
         def add_cluster(node: ClusterView, state: ExtraState) -> ExtraState:
             """Add a node to the state on lanes on which it is far. The state consists of the state
@@ -430,7 +433,7 @@ class Treecode:
             # Its terms; where it is far; 1/r; the factor A + K/r^2 of the remainder; truncation
             # errors of value, gradient and Hessian, the latter two without their constant ratios;
             # the distance at which it counts as a singular point; the rounding.
-            sums = SourceSums.from_state(state[0]).add_far_node(
+            sums = no_sums.with_state(state[0]).add_far_node(
                 multipole_terms(c, node.r, inverse, derivatives),
                 node.far,
                 inverse,
@@ -444,17 +447,15 @@ class Treecode:
         def add_primitive(row: list[Real], active: Mask, state: ExtraState) -> ExtraState:
             """Add the primitive in the record `row` of a near leaf to the state, on active lanes.
             Returns the new state."""
-            sums, extra_state = add(row, active, SourceSums.from_state(state[0]), state[1])
+            sums, extra_state = add(row, active, no_sums.with_state(state[0]), state[1])
             return sums.to_state(), extra_state
 
-        # The distance that is taken to be free of sources if no node bounds it.
-        no_source = _NO_SOURCE_DISTANCE * (1 + dr.max(dr.abs(x)))
-        start = (SourceSums.zero(self.backend, no_source, derivatives).to_state(), extra_state)
+        start = no_sums.to_state(), extra_state
         state = traverse_clusters(self.tree, x, closer, add_cluster, add_primitive, start, active)
         # Below the accuracy scale 1, nodes may be nearer than the distance at which their bounds E
         # hold: they hold times this ratio.
         sums, error_ratio = (
-            SourceSums.from_state(state[0]),
+            no_sums.with_state(state[0]),
             dr.select(detail < 1, self.coarse_error_ratio, 1),
         )
         # The loop has added up error bounds without the ratios, which are the same for all nodes:

@@ -3,6 +3,7 @@ coordinates in them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,19 @@ def round_to_single(center: FloatArray) -> FloatArray:
     with np.errstate(over="ignore"):
         rounded = center.astype(np.float32).astype(np.float64)
     return np.where(np.isfinite(rounded), rounded, center)
+
+
+def center_and_size(
+    low: FloatArray, high: FloatArray, least_size: float = 0.0
+) -> tuple[FloatArray, float]:
+    """The center (3,) and the size of unit coordinates for data in a box. The size is a power of
+    two, so that lengths are scaled without rounding: at least half the longest side of the box.
+
+    low, high: (3,) opposite corners of the box.
+    least_size: another lower bound of the size.
+    """
+    extent = max(0.5 * float((high - low).max()), least_size)
+    return round_to_single(0.5 * (low + high)), 2.0 ** math.ceil(math.log2(extent))
 
 
 def frame_parameters(

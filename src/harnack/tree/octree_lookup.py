@@ -10,22 +10,23 @@ returns the index of a leaf; the caller keeps what belongs to the leaf, such as 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import IntArray
+from harnack.backend import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, BoolArray, FloatArray, Mask, Real, Vec3
+    from harnack.backend import Backend, IntArray, Mask, Real, Vec3
 
-__all__ = ["BALL_MARGIN", "MAX_DEPTH", "OCTANT_DIRECTIONS", "OctreeLookup", "encode_nodes"]
+__all__ = ["BALL_MARGIN", "OCTANT_OFFSET", "OctreeCells", "OctreeLookup"]
 
-# The smallest cells have 2^-MAX_DEPTH of the width of the cube. A lookup begins in a uniform grid
+# The smallest cells have 2^-_MAX_DEPTH of the width of the cube. A lookup begins in a uniform grid
 # whose cells have 2^-_TOP_DEPTH of it.
-MAX_DEPTH, _TOP_DEPTH = 10, 5
+_MAX_DEPTH, _TOP_DEPTH = 10, 5
 # What is used for all points of a cell has to be proved in a ball: the ball around the cell,
 # enlarged by this factor, because rounding may move a point out of the cell. Rounding in single
 # precision moves it by less than 2^-20 of the cube's width; the enlarged balls of the smallest
@@ -33,25 +34,41 @@ MAX_DEPTH, _TOP_DEPTH = 10, 5
 BALL_MARGIN = 1.004
 # Vectors from the center of a cube to the centers of its octants, in quarters of the cube's width;
 # the z component changes fastest.
-OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+_OCTANT_DIRECTIONS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+# The offset of an octant's center from the center of its cell along each axis, in units of the
+# radius of the cell's ball.
+OCTANT_OFFSET = 0.5 / (math.sqrt(3) * BALL_MARGIN)
 
 
-def encode_nodes(is_leaf: BoolArray, leaves: int, split: int) -> IntArray:
-    """Encode the nodes of one depth of an octree as integers, for `OctreeLookup.from_levels`. An
-    inner node is encoded as the index of its first child, leaf k as -1 - k. Leaves and inner nodes
-    are each numbered depth by depth.
+@dataclass(frozen=True)
+class OctreeCells:
+    """The cells of one depth of an octree: cubes of equal size.
 
-    is_leaf: (n,) whether each node of this depth is a leaf.
-    leaves: the number of leaves at smaller depths.
-    split: the number of inner nodes at smaller depths, the root included.
-
-    Returns (n,) the encoded nodes.
+    centers: (n, 3) the centers of the cells.
+    half_side: half the side of a cell.
+    depth: 0 for the whole cube.
     """
-    number = np.empty(len(is_leaf), np.int64)
-    number[is_leaf] = -1 - (leaves + np.arange(int(is_leaf.sum())))
-    # The children of inner node j begin at 8 j, as the root is not in the list of nodes.
-    number[~is_leaf] = 8 * (split + np.arange(int((~is_leaf).sum())))
-    return number
+
+    centers: FloatArray
+    half_side: float
+    depth: int = 0
+
+    @property
+    def radius(self) -> float:
+        """The radius of the balls around the cells (`BALL_MARGIN`)."""
+        return math.sqrt(3) * self.half_side * BALL_MARGIN
+
+    @property
+    def is_last(self) -> bool:
+        """Whether no cell of this depth may be divided."""
+        return self.depth == _MAX_DEPTH
+
+    def octants(self, is_divided: BoolArray) -> OctreeCells:
+        """The octants of the cells on which the mask (n,) is true. Those of a cell follow each
+        other."""
+        half = 0.5 * self.half_side
+        centers = self.centers[is_divided][:, None] + half * _OCTANT_DIRECTIONS
+        return OctreeCells(centers.reshape(-1, 3), half, self.depth + 1)
 
 
 @dataclass(frozen=True)
@@ -61,7 +78,7 @@ class OctreeLookup:
     consecutive children (z fastest), leaf k as -1 - k.
 
     lower_corner: (3,) the lower corner of the cube.
-    cells_per_length: 2^MAX_DEPTH divided by the width of the cube.
+    cells_per_length: 2^_MAX_DEPTH divided by the width of the cube.
     top_grid: (8^_TOP_DEPTH,) an encoded node for each cell of a uniform grid, z fastest. It is the
         node of depth _TOP_DEPTH that fills the cell, or a leaf of smaller depth that contains the
         cell.
@@ -76,22 +93,27 @@ class OctreeLookup:
 
     @classmethod
     def from_levels(
-        cls, backend: Backend, low: FloatArray, side: float, levels: list[IntArray]
+        cls, backend: Backend, low: FloatArray, side: float, levels: list[BoolArray]
     ) -> OctreeLookup:
         """Upload an octree.
 
         low, side: the lower corner (3,) and the width of its cube.
-        levels: for each depth, the root first, the encoded nodes (`encode_nodes`). The eight
-            children of each inner node follow each other, in the order of the inner nodes of the
-            depth above.
+        levels: for each depth, the root first, the mask (n,) of the nodes that are leaves. The
+            eight children of each inner node follow each other, in the order of the inner nodes of
+            the depth above.
+
+        Leaves and inner nodes are each numbered in the order of `levels`.
         """
-        root, *below = levels
+        is_leaf = np.concatenate(levels)
+        # The children of inner node j begin at 8 j, as the root is not in the list of nodes.
+        leaves, inner = (np.cumsum(mask, dtype=np.int64) for mask in (is_leaf, ~is_leaf))
+        encoded = np.where(is_leaf, -leaves, 8 * (inner - 1))
         # Eight unused entries: if the root is a leaf, lookups of children still read something.
-        nodes = np.concatenate([*below, np.zeros(8, np.int64)])
+        nodes = np.append(encoded[1:], np.zeros(8, np.int64))
         corner = backend.Array3f(*(dr.opaque(backend.Float, float(number)) for number in low))
         return cls(
-            backend, corner, dr.opaque(backend.Float, 2**MAX_DEPTH / side),
-            backend.Int32(_build_top_grid(int(root[0]), nodes).astype(np.int32)),
+            backend, corner, dr.opaque(backend.Float, 2**_MAX_DEPTH / side),
+            backend.Int32(_build_top_grid(int(encoded[0]), nodes).astype(np.int32)),
             backend.Int32(nodes.astype(np.int32)),
         )  # fmt: skip
 
@@ -109,12 +131,12 @@ class OctreeLookup:
         """
         index, integer = self.backend.UInt32, self.backend.Int32
         position = (x - self.lower_corner) * self.cells_per_length
-        is_inside = dr.all((position >= 0) & (position < float(2**MAX_DEPTH)))
+        is_inside = dr.all((position >= 0) & (position < float(2**_MAX_DEPTH)))
         ix, iy, iz = (index(dr.select(is_inside, position[k], 0)) for k in range(3))
         # self.top_grid has the encoded node for each cell of the uniform grid.
         # Integer coordinates in cells of the greatest depth. Their upper bits give the cell of the
         # uniform grid, the other `down` bits one octant for each further depth.
-        down = MAX_DEPTH - _TOP_DEPTH
+        down = _MAX_DEPTH - _TOP_DEPTH
         grid_index = (((ix >> down) << _TOP_DEPTH | (iy >> down)) << _TOP_DEPTH) | (iz >> down)
 
         def is_inner(node: Any, *_: Any) -> Mask:
@@ -139,7 +161,7 @@ def _build_top_grid(encoded_root: int, nodes: IntArray) -> IntArray:
     """The array `OctreeLookup.top_grid` (8^_TOP_DEPTH,): for each cell of a uniform grid, z
     fastest, the encoded node that the cell is, or the encoded leaf that contains the cell.
 
-    encoded_root: the root, encoded as by `encode_nodes`.
+    encoded_root: the root, encoded as `OctreeLookup` says.
     nodes: all other nodes, encoded.
     """
     grid = np.full((1, 1, 1), encoded_root, np.int64)

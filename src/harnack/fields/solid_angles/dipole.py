@@ -36,7 +36,7 @@ from harnack.fields.solid_angles.cell_options import CellChoice, FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
 from harnack.fields.solid_angles.oriented_points import OrientedPoints
 from harnack.fields.solid_angles.smoothed import SmoothedSum
-from harnack.fmm.dipole_cells import DipoleCells, build_cells
+from harnack.fmm.dipole_cells import DipoleCells, TreeWithCells, build_cells
 from harnack.fmm.multipole import dipole_tree_moments
 from harnack.fmm.point_values import PointValues, SymmetricMatrix, sharpened
 from harnack.fmm.source_sums import SourceSums, SourceTerm, dipole_rounding, final_rounding
@@ -47,7 +47,7 @@ from harnack.fmm.treecode import (
     dipole_records,
     records_in_slots,
 )
-from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
+from harnack.fmm.unit_frame import UnitFrame, center_and_size, coordinate_rounding, frame_parameters
 from harnack.geometry import Box, CloudError, estimate_areas, estimate_normals, validate_cloud
 
 if TYPE_CHECKING:
@@ -75,26 +75,12 @@ BuildCells: TypeAlias = "Callable[[list[NodeMoments], FloatArray, RecordTable], 
 its dipoles as records, and the same records on the backend."""
 
 
-@dataclass(frozen=True)
-class DipoleTree:
+class DipoleTree(TreeWithCells):
     """The sum f(x) of m_i.(y_i - x)/|y_i - x|^3 over all dipoles i, on a backend. The positions y_i
     and the moments m_i, which are area times normal, are in unit coordinates: the cloud is centered
     at 0 and its size is about one. Far dipoles are summed by the tree's multipole moments or by the
     cells, near dipoles one by one. A record of a dipole holds y_i, m_i and |m_i|.
-
-    clusters: the tree with its multipole moments.
-    rounding: a bound of the rounding of the last operations, which turn the sums into f.
-    cells: FMM cells of the dipoles, with which the cost of a sample depends only on the number of
-        near dipoles; None for no cells.
     """
-
-    clusters: Treecode
-    rounding: Real
-    cells: DipoleCells | None = None
-
-    @property
-    def backend(self) -> Backend:
-        return self.clusters.backend
 
     @classmethod
     def of(
@@ -122,12 +108,6 @@ class DipoleTree:
         cells = None if build is None else build(levels, slots, clusters.tree.primitives)
         return cls(clusters, rounding, cells)
 
-    @property
-    def coarsest_accuracy(self) -> float:
-        """The smallest accuracy scale that makes a difference: a smaller one gives the same samples
-        (`VariableAccuracy.coarsest`). It is 1 if there are cells, which have a single accuracy."""
-        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
-
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """Compute f at points x, with derivatives and with error bounds, in unit coordinates.
 
@@ -143,27 +123,10 @@ class DipoleTree:
         sums, _ = self._near_sums(x, detail, unit, derivatives)
         return self.clusters.values(sums, 1.0, unit, self.rounding)  # f is 1.0 times the sum
 
-    def _sums(self, x: Vec3, detail: Real, unit: Real, derivatives: int) -> tuple[SourceSums, Vec3]:
-        """Sum over all dipoles at points x, by the tree.
-
-        x: (3, n).
-        detail: the accuracy scale; larger is more accurate.
-        unit: a bound of the rounding of a coordinate of x.
-        derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
-
-        Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
-        one by one, and not by the moments of a node.
-        """
-        # self.clusters: the tree with its multipole moments.
-        add, vector = _dipole_adder(x, unit, derivatives), self.backend.Array3f
-        sums, state = self.clusters.sums(x, detail, add, (vector(0),), derivatives=derivatives)
-        return sums, state[0]
-
     def _near_sums(
         self, x: Vec3, detail: Real, unit: Real, derivatives: int = 1
     ) -> tuple[SourceSums, Vec3]:
-        """Sum over all dipoles at points x: by the cells if there are cells and no second
-        derivatives are requested, else by the tree.
+        """Sum over all dipoles at points x.
 
         x: (3, n).
         detail: the accuracy scale; larger is more accurate.
@@ -173,11 +136,9 @@ class DipoleTree:
         Returns the sums, and the moment (3, n) of the nearest dipole: among those that are summed
         one by one, and not by a node or a cell.
         """
-        if self.cells is None or derivatives == 2:
-            return self._sums(x, detail, unit, derivatives)
         # The state is the moment of the nearest dipole so far; cells and tree add dipoles alike.
-        add, start = _dipole_adder(x, unit, 1), (self.backend.Array3f(0),)
-        sums, state = self.cells.sums_with_tree(self.clusters, x, detail, (add, add), start)
+        add, start = _dipole_adder(x, unit), (self.backend.Array3f(0),)
+        sums, state = self.sums(x, detail, lambda _: add, start, derivatives=derivatives)
         return sums, state[0]
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
@@ -200,13 +161,12 @@ class DipoleTree:
         return sums.sample(1.0, unit, self.rounding, normal)
 
 
-def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
+def _dipole_adder(x: Vec3, unit: Real) -> AddPrimitive:
     """Return a function that adds one dipole to sums over dipoles at points x
     (`treecode.AddPrimitive`).
 
     x: (3, n).
     unit: a bound of the rounding of a coordinate of x.
-    derivatives: 0 for the value only, 1 with the gradient, 2 with the Hessian.
     """
     vector = cast("Any", type(x))
 
@@ -222,7 +182,7 @@ def _dipole_adder(x: Vec3, unit: Real, derivatives: int) -> AddPrimitive:
 
         Returns the new sums and the new state.
         """
-        inverse, terms = _dipole_term(row, x, derivatives)
+        inverse, terms = _dipole_term(row, x, sums.derivatives)
         distance, has_area = dr.rcp(inverse), active & (row[6] > 0)
         # `upper` is an upper bound of 1/(distance - 2 unit): one over the true distance is at most
         # this, as 2 unit bounds the rounding of the distance. With z = 2 unit/distance,
@@ -394,12 +354,10 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
         self.accuracy = accuracy
         self.configure_cells(cells)
         self._box = low, high = self.points.min(axis=0), self.points.max(axis=0)
-        # Unit coordinates: relative to the center, over a power of two as size, so that the
-        # division does not round. The size is no smaller than a quarter of the root of the total
-        # area: some clouds have areas that are large for their box.
-        self._center = round_to_single(0.5 * (low + high))
-        extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.sum())) / 4)
-        self._size = 2.0 ** math.ceil(math.log2(extent))
+        # The size is no smaller than a quarter of the root of the total area: some clouds have
+        # areas that are large for their box.
+        least_size = math.sqrt(float(self.areas.sum())) / 4
+        self._center, self._size = center_and_size(low, high, least_size)
         # The hierarchy of the tree of the field from which `with_points` made this one.
         self._given_hierarchy: BalancedTree | None = None
         self._smoothing = (

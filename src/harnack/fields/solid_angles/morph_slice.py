@@ -25,7 +25,6 @@ import numpy as np
 from numpy.polynomial import chebyshev, legendre
 
 from harnack.backend import backend_of
-from harnack.backend.elementary import fmax
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall
 from harnack.fields.batch_evaluation import evaluate_points
@@ -41,9 +40,8 @@ from harnack.fmm.radial_kernel import (
     RadialSums,
 )
 from harnack.fmm.radial_tree import ClusteredDipoles, RadialTreecode
-from harnack.fmm.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.fmm.treecode import dipole_records
-from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
+from harnack.fmm.unit_frame import UnitFrame, center_and_size, coordinate_rounding, frame_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -427,9 +425,7 @@ class MorphSlice(SourceSum):
         low = np.min([mesh.min(axis=(0, 1)) for mesh in corners], axis=0)
         high = np.max([mesh.max(axis=(0, 1)) for mesh in corners], axis=0)
         self._box = low, high
-        self._center = round_to_single(0.5 * (low + high))
-        # A power of two, so that lengths are scaled without rounding.
-        self._size = 2.0 ** math.ceil(math.log2(0.5 * float((high - low).max())))
+        self._center, self._size = center_and_size(low, high)
         # The longest edges of pieces, for each mesh.
         longest = [spacing * height for height in self.heights]
         _check_count([piece_counts(*pair) for pair in zip(corners, longest, strict=True)], w, gap)
@@ -468,11 +464,9 @@ class MorphSlice(SourceSum):
         """
         buffers = self._upload(backend_of(x))
         x = buffers.to_unit(x)
-        sums = buffers.sums(x, closer, derivatives).sums
-        # rounding: of the last operations. weight: the sum of the lengths of all moments. f is 1.0
-        # times the sum. 64 terms: far away a point sums only a few clusters.
-        rounding = 8 * buffers.backend.machine_epsilon * dr.abs(sums.value)
-        values = sums.values(1.0, coordinate_rounding(x), rounding)
+        values = buffers.sums(x, closer, derivatives).values(x)
+        # The sum of the lengths of all moments. 64 terms: far away a point sums only a few
+        # clusters.
         weight = sum(float(dipoles.rows[:, 6].sum()) for dipoles in self._dipoles)
         return values.with_far_field_errors(x, 64, weight).rescaled(buffers.size)
 
@@ -622,15 +616,11 @@ class _SliceBuffers(UnitFrame):
         x = self.to_unit(p)
         radial = self.sums(x, detail, 1)  # 1: with gradients
         sums = radial.sums
-        # Of the rounding of positions (s4 is a sum that bounds it), and of truncation.
-        slope_error = dr.fma(
-            SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
-        )
-        # A lower bound of the distance, in four dimensions, to the nearest quadrature point, also
-        # after rounding; and the range of f on the ball around x of radius r, a ball in four
-        # dimensions, in which f is harmonic.
-        nearest = sums.singularity_distance * (1 - SUM_MARGIN) - 8 * self.backend.machine_epsilon
-        nearest = fmax(nearest, 0)
+        slope_error = sums.gradient_error(coordinate_rounding(x))
+        # A lower bound of the distance, in four dimensions, to the nearest quadrature point; and
+        # the range of f on the ball around x of radius r, a ball in four dimensions, in which f is
+        # harmonic.
+        nearest = radial.least_distance
         r = BALL_FRACTION * nearest
         # 1.0: the bounds of this kernel do not grow if distances shrink (`SlicedKernel.growth`).
         change = radial.variation(r, 1.0)

@@ -42,7 +42,7 @@ from harnack.fmm.radial_tree import (
 )
 from harnack.fmm.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN, SourceSums
 from harnack.fmm.treecode import dipole_records
-from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters, round_to_single
+from harnack.fmm.unit_frame import UnitFrame, center_and_size, coordinate_rounding, frame_parameters
 from harnack.geometry.clouds import estimate_areas, validate_cloud
 from harnack.geometry.meshes import validate_mesh
 from harnack.name_suggestions import did_you_mean
@@ -147,7 +147,7 @@ def thetas(t: Real, last: int) -> list[Real]:
 
 
 def screened_promises(
-    radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real, epsilon: float
+    radial: RadialSums, f: Real, gradient: Vec3, kernel: YukawaKernel, size: Real
 ) -> tuple[tuple[TaylorRemainder, ...], HarmonicBall]:
     """Proved bounds of f, a sum over screened dipoles, near a point x. Returns a tuple of bounds of
     second derivatives, each on a ball around x; and one ball with a range of f, which proves
@@ -158,15 +158,13 @@ def screened_promises(
     kernel: the kernel of the sum.
     size: the length, in the user's unit, that is 1 in unit coordinates. The results are in the
         user's unit.
-    epsilon: the machine epsilon of the backend.
 
     kappa is one over the screening length. Radii r stay below 36 screening lengths. So the factor
     exp(kappa r), times sums in which exponentials are at least exp(-80), neither overflows nor
     grows.
     """
     sums, kappa = radial.sums, kernel.kappa
-    nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
-    max_radius = fmin(nearest, MAX_LENGTHS / kappa)
+    max_radius = fmin(radial.least_distance, MAX_LENGTHS / kappa)
     promises = radial.curvatures(kernel.growth, max_radius, size)
     # The radius R of the ball with a range. S is the smaller of two bounds of the change of f.
     r = BALL_FRACTION * max_radius / dr.fma(_BALL_SHRINKAGE * kappa, max_radius, 1)
@@ -341,12 +339,10 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         )
         has_variable_accuracy = self.method == "tree"
         self.traits = dataclasses.replace(self.traits, has_variable_accuracy=has_variable_accuracy)
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
-        # Half the longest side of the box; more for few points that stand for large areas.
-        extent = max(0.5 * float((high - low).max()), math.sqrt(float(self.areas.max())))
-        self._center = round_to_single(0.5 * (low + high))
-        # A power of two, so that lengths are scaled without rounding.
-        self._size = 2.0 ** math.ceil(math.log2(extent))
+        # The size is larger for few points that stand for large areas.
+        self._center, self._size = center_and_size(
+            self.points.min(axis=0), self.points.max(axis=0), math.sqrt(float(self.areas.max()))
+        )
         scale = self.areas[:, None] / (4 * math.pi * self._size**2)
         self._rows = dipole_records((self.points - self._center) / self._size, scale * self.normals)
         self._kappa = self._size / self.length
@@ -411,10 +407,9 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         """
         data = self._upload(backend_of(x))
         x = data.to_unit(x)
-        sums, epsilon = data.dipoles.sums(x, closer, derivatives).sums, data.backend.machine_epsilon
-        # w is 1.0 times the sum. The last argument bounds the rounding of the last operations.
-        values = sums.values(1.0, coordinate_rounding(x), 8 * epsilon * dr.abs(sums.value))
-        cutoff, slope, second = data.cutoff_errors(sums, coordinate_rounding(x))
+        radial = data.dipoles.sums(x, closer, derivatives)
+        values = radial.values(x)
+        cutoff, slope, second = data.cutoff_errors(radial.sums, coordinate_rounding(x))
         values = dataclasses.replace(
             values,
             error=values.error + cutoff,
@@ -552,9 +547,7 @@ class _ScreenedBuffers(UnitFrame):
         steep_gradient = self.backend.Array3f(0, 0, _ANY_LEVEL / (_ON_DIPOLE * epsilon))
         value = dr.select(is_off_dipole, sums.value, 0)
         gradient = dr.select(is_off_dipole, sums.gradient, steep_gradient)
-        promises, ball = screened_promises(
-            screened, value, gradient, self.kernel, self.size, epsilon
-        )
+        promises, ball = screened_promises(screened, value, gradient, self.kernel, self.size)
         return Sample(
             value,
             gradient / self.size,

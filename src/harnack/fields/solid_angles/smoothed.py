@@ -23,7 +23,6 @@ from harnack.fmm.radial_tree import (
     RadialTreecode,
     taylor_tree_moments,
 )
-from harnack.fmm.source_sums import SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.fmm.unit_frame import coordinate_rounding
 
 if TYPE_CHECKING:
@@ -136,9 +135,7 @@ class SmoothedSum:
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """f and its derivatives up to order `derivatives` at points x (3, n), with error bounds.
         closer: the accuracy scale; larger is more accurate. Values below 1 count as 1."""
-        sums = self.dipoles.sums(x, closer, derivatives).sums
-        rounding = 8 * self.dipoles.backend.machine_epsilon * dr.abs(sums.value)
-        return sums.values(1.0, coordinate_rounding(x), rounding)
+        return self.dipoles.sums(x, closer, derivatives).values(x)
 
     def sample(self, x: Vec3, detail: Real) -> Sample:
         """A sample of f at points x: value, gradient, errors and proved bounds of second
@@ -146,20 +143,14 @@ class SmoothedSum:
         # radial: with gradients, and with sums for bounds near x. sums: value, gradient and errors.
         radial = self.dipoles.sums(x, detail, 1)
         sums = radial.sums
-        # The error of the gradient: of positions, and of truncation.
-        slope_error = dr.fma(
-            SLOPE_ROUNDINGS * coordinate_rounding(x), sums.s4, sums.gradient_truncation
-        )
         epsilon = self.dipoles.backend.machine_epsilon
-        # A lower bound of the distance to the nearest dipole, also after rounding.
-        nearest = fmax(sums.singularity_distance * (1 - SUM_MARGIN) - 8 * epsilon, 0)
         # Bounds of second derivatives need no growth factor for this kernel (`SmoothedKernel`), and
         # no scaling, since lengths stay in the unit of x.
         return Sample(
             sums.value,
             sums.gradient,
-            radial.curvatures(lambda r: 1.0, nearest, 1.0),
+            radial.curvatures(lambda r: 1.0, radial.least_distance, 1.0),
             sums.truncation + sums.rounding + 8 * epsilon * dr.abs(sums.value),
-            slope_error,
+            sums.gradient_error(coordinate_rounding(x)),
             truncation_error=sums.truncation,
         )

@@ -47,7 +47,7 @@ from harnack.fmm.curve_queries import (
     segment_records,
 )
 from harnack.fmm.edges import (
-    EdgeSums,
+    CurveSums,
     LoopEdges,
     hessian_over_edges,
     sum_over_edges,
@@ -573,7 +573,7 @@ class CurveEvaluator(Evaluator):
                 sums.angle, sums.gradient, sums.inverse_squares, promises, errors.slope
             )
         elif self.field.lift_bound == "planar":
-            ball = self._planar_ball(x, sums, distance, errors.value)
+            ball = self._planar_ball(x, sums, distance, errors)
         else:
             ball = _convex_ball(sums.angle, distance, errors.value + value_rounding)
         # At the curve itself, up to rounding, f has all values (`remaining_edges`) and no gradient:
@@ -585,8 +585,8 @@ class CurveEvaluator(Evaluator):
         gradient_error = errors.slope
         truncation = dr.select(is_on_curve, 0, errors.value)
         error = truncation + dr.select(is_on_curve, errors.rounding, value_rounding)
-        if sums.circles is not None:
-            circles = sums.circles
+        if errors.circles is not None:
+            circles = errors.circles
             # Measured errors: 15 units in the last place of a circle's angle, and 60 of its
             # gradient near the circle (10 elsewhere). Its position is rounded by a few units too.
             point_error = epsilon * (4 + 4 * dr.max(dr.abs(x)))
@@ -617,23 +617,25 @@ class CurveEvaluator(Evaluator):
         )
         return space_scaled(sample, data.size)
 
-    def _planar_ball(self, x: Vec3, sums: CurveSums, distance: Real, error: Real) -> HarmonicBall:
+    def _planar_ball(
+        self, x: Vec3, sums: CurveSums, distance: Real, errors: CellErrors
+    ) -> HarmonicBall:
         """A ball around each point x that meets no curve, and a range of the lift of f on it, for
         `lift_bound="planar"`. The range comes from the region of a plane that the curve bounds, or
         from the circles if there are only circles.
 
         x: the points, in unit coordinates.
-        sums: the sums over edges and circles at x.
+        sums, errors: the sums over edges and circles at x, and their error bounds.
         distance: a lower bound of the distance from x to the curve, in unit coordinates.
-        error: a bound of the truncation error of f.
         """
         data = self.data
         if data.region is None:
-            circles = sums.circles
-            assert circles is not None
-            return HarmonicBall(distance, circles.lower, circles.upper)
+            assert errors.circles is not None
+            return HarmonicBall(distance, errors.circles.lower, errors.circles.upper)
         height_rounding = data.rounding + data.backend.machine_epsilon * 4 * dr.max(dr.abs(x))
-        return data.region.lift_range(sums.angle, data.height(x), distance, height_rounding, error)
+        return data.region.lift_range(
+            sums.angle, data.height(x), distance, height_rounding, errors.value
+        )
 
     def _zero_sample(self, p: Vec3) -> Sample:
         """The sample of the constant 0 at points p, for curves whose edges all cancel each other.
@@ -681,7 +683,7 @@ class CurveEvaluator(Evaluator):
         if data.is_empty:
             return 0.0, 0.0
         x = data.to_unit(p)
-        sums, unit = data.sums(x), coordinate_rounding(x)
+        (sums, _), unit = data.sums(x), coordinate_rounding(x)
         distance = sums.distance - 4 * unit
         # The second condition is that of `_sample`.
         is_off_curve = (distance > 0) & (sums.distance > 2 * data.rounding)
@@ -702,7 +704,7 @@ class CurveEvaluator(Evaluator):
             return 0 * p.x  # f is constant: 0 on each lane
         x, unit_radius = data.to_unit(p), radius / data.size + data.rounding
         # inverse_cubes, inverse_fourths: the integrals of |dp|/D^3 and |dp|/D^4 over the curve.
-        sums = data.sums(x)
+        sums, _ = data.sums(x)
         distance = sums.distance * (1 - SUM_MARGIN) - data.rounding
         return (
             gradient_change_bound(sums.inverse_cubes, sums.inverse_fourths, distance, unit_radius)
@@ -770,26 +772,22 @@ class _CurveData(UnitFrame):
         the errors of these sums. On lanes on which x is in an FMM cell and the accuracy scale
         `detail` is at most 1, the sums over edges come from that cell. On all other lanes, and if
         there are no cells, all edges are summed. A larger accuracy scale is more accurate."""
-        if self.cells is None or self.edges is None:
-            # No truncation errors: all edges are summed.
-            return self.sums(x), CellErrors(0.0, 0.0, self.value_rounding)
-        cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
-        edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
-        # Both objects have the same attributes, in the order of the parameters of `CurveSums`. The
-        # first ones are taken in cells, the second ones elsewhere.
-        pairs = zip(vars(cell_sums.sums).values(), vars(edge_sums).values(), strict=True)
-        sums = CurveSums(*(dr.select(is_in_cell, inner, outer) for inner, outer in pairs))
-        errors = CellErrors(
-            dr.select(is_in_cell, cell_sums.error, 0),
-            dr.select(is_in_cell, cell_sums.slope_error, 0),
-            dr.select(is_in_cell, cell_sums.rounding, self.value_rounding),
-            cell_sums,
-            is_in_cell,
-        )
-        if self.circles is not None:
-            circles = self.circles.sums(x)
-            sums = sums.plus(dataclasses.replace(CurveSums.of(circles), circles=circles))
-        return sums, errors
+        edge_sums = None
+        # No truncation errors where all edges are summed.
+        errors = CellErrors(0.0, 0.0, self.value_rounding)
+        if self.cells is not None and self.edges is not None:
+            cell_sums, is_in_cell = self.cells.sums(x, detail <= 1)
+            edge_sums = sum_over_edges(self.edges, x, ~is_in_cell)
+            edge_sums = edge_sums.select(is_in_cell, cell_sums.sums)
+            errors = CellErrors(
+                dr.select(is_in_cell, cell_sums.error, 0),
+                dr.select(is_in_cell, cell_sums.slope_error, 0),
+                dr.select(is_in_cell, cell_sums.rounding, self.value_rounding),
+                cell_sums,
+                is_in_cell,
+            )
+        sums, circles = self.sums(x, edge_sums)
+        return sums, dataclasses.replace(errors, circles=circles)
 
     def edge_rates(
         self, sum_errors: CellErrors, line: RayLine, lengths: tuple[Real, ...], active: Mask
@@ -827,16 +825,20 @@ class _CurveData(UnitFrame):
         assert self.plane is not None
         return dr.dot(self.backend.Array3f(*self.plane[:3]), x) - self.plane[3]
 
-    def sums(self, x: Vec3) -> CurveSums:
-        """The sums over all edges and circles at points x in unit coordinates, without FMM
-        cells."""
-        parts: list[CurveSums] = []
-        if self.edges is not None:
-            parts.append(CurveSums.of(sum_over_edges(self.edges, x)))
-        if self.circles is not None:
-            circles = self.circles.sums(x)
-            parts.append(dataclasses.replace(CurveSums.of(circles), circles=circles))
-        return functools.reduce(CurveSums.plus, parts)
+    def sums(
+        self, x: Vec3, edge_sums: CurveSums | None = None
+    ) -> tuple[CurveSums, CircleSums | None]:
+        """The sums over all edges and circles at points x in unit coordinates; and the sums over
+        the circles only, or None if there are none.
+
+        edge_sums: the sums over the edges; None to sum over all edges, without FMM cells.
+        """
+        if edge_sums is None and self.edges is not None:
+            edge_sums = sum_over_edges(self.edges, x)
+        circles = None if self.circles is None else self.circles.sums(x)
+        # A curve that is not empty has edges or circles.
+        first, *rest = (sums for sums in (edge_sums, circles) if sums is not None)
+        return functools.reduce(CurveSums.plus, rest, first), circles
 
 
 @dataclass(frozen=True)
@@ -850,6 +852,7 @@ class CellErrors:
     rounding: a bound of the rounding of the solid angle.
     cell: the sums that the cells gave; None without cells.
     in_cells: the mask of the lanes on which the sums of the cells were used; False without cells.
+    circles: the sums over circles only, which have errors of their own; None if there are none.
     """
 
     value: Real
@@ -857,47 +860,7 @@ class CellErrors:
     rounding: Real
     cell: CurveCellSums | None = None
     in_cells: Mask = False
-
-
-@dataclass(frozen=True)
-class CurveSums:
-    """Sums over the edges and circles of a curve at points x, from which the solid angle f and its
-    proved bounds are computed.
-
-    angle, gradient: f, modulo 4 pi, and its gradient.
-    distance: the distance from x to the nearest edge or circle, or a lower bound of it.
-    inverse_squares, inverse_cubes, inverse_fourths: the integrals of |dp|/D^k along the curve for k
-        = 2, 3 and 4, with D the distance from x to the point p of the curve; or upper bounds of
-        them.
-    circles: the sums over circles only; None if there are no circles.
-    """
-
-    angle: Real
-    gradient: Vec3
-    distance: Real
-    inverse_squares: Real
-    inverse_cubes: Real
-    inverse_fourths: Real
     circles: CircleSums | None = None
-
-    @classmethod
-    def of(cls, sums: EdgeSums | CircleSums) -> CurveSums:
-        """Take the sums over the edges, or over the circles, as the sums over a whole curve."""
-        integrals = sums.inverse_squares, sums.inverse_cubes, sums.inverse_fourths
-        return cls(sums.angle, sums.gradient, sums.distance, *integrals)
-
-    def plus(self, other: CurveSums) -> CurveSums:
-        """The sums over two curves together: of this object, and of `other`. The smaller of both
-        distances is kept."""
-        return CurveSums(
-            self.angle + other.angle,
-            self.gradient + other.gradient,
-            fmin(self.distance, other.distance),
-            self.inverse_squares + other.inverse_squares,
-            self.inverse_cubes + other.inverse_cubes,
-            self.inverse_fourths + other.inverse_fourths,
-            other.circles if self.circles is None else self.circles,
-        )
 
 
 def _convex_ball(angle: Real, distance: Real, error: Real) -> HarmonicBall:

@@ -101,7 +101,7 @@ class ExactWinding:
     has_detail: ClassVar[bool] = False
     """Whether samples at small accuracy scales take less time. They do not: all are exact."""
 
-    coarsest_detail: ClassVar[float] = 0.5
+    coarsest_accuracy: ClassVar[float] = 0.5
     """The smallest accuracy scale that makes a difference (`VariableAccuracy.coarsest`). Only FMM
     cells of the boundary distinguish it from 1, so that any number below 1 will do."""
 
@@ -142,7 +142,7 @@ class ExactWinding:
             # Value and its error, gradient, Hessian, and the errors of both.
             zeros = self.backend.Array3f(0), SymmetricMatrix.zero(real)
             return PointValues(turns, real(self.rounding), *zeros, real(0), real(0))
-        sums, unit = lifted_sums(self.edges, x, derivatives).total(), coordinate_rounding(x)
+        sums, unit = lifted_sums(self.edges, x, derivatives), coordinate_rounding(x)
         # The sums are solid angles: 4 pi w.
         sums = sums.add_term(SourceTerm(4 * math.pi * turns), True)
         return sums.values(_PER_SPHERE, unit, self.rounding)

@@ -768,7 +768,7 @@ class _CellSamples(ModuloOne):
     @property
     def sure_accuracy(self) -> float:
         """The smallest accuracy scale at which samples give w with its integer."""
-        return self.data.winding.coarsest_detail
+        return self.data.winding.coarsest_accuracy
 
     def evaluate(self, p: Vec3) -> Sample:
         """A coarsest sample of w minus an unknown integer at points p."""
@@ -882,7 +882,7 @@ class _WindingOnInterval(Evaluator):
             # integer.
             at = functools.partial(_WindingOnInterval, on, frame, behind, offset)
             self.variable_accuracy: VariableAccuracy | None = VariableAccuracy(
-                at, on.winding.coarsest_detail, has_cells
+                at, on.winding.coarsest_accuracy, has_cells
             )
 
     def evaluate(self, p: Vec3) -> Sample:
@@ -897,7 +897,7 @@ class _WindingOnInterval(Evaluator):
         # Samples from cells leave an integer unknown. So they count as coarser than all others, and
         # serve only accuracy scales below the coarsest one.
         from_cells, is_in_cell = data.cells.sample(
-            x, frame.d, unit, detail < data.winding.coarsest_detail
+            x, frame.d, unit, detail < data.winding.coarsest_accuracy
         )
         sample = data.winding.sample_interval(
             frame, x, self._behind, self._offset, detail, ~is_in_cell

@@ -33,9 +33,9 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax
-from harnack.fmm.dipole_cells import DipoleCells, build_cells
-from harnack.fmm.dipole_expansion import TRIANGLE_RATIO, triangle_sources
-from harnack.fmm.edge_lift import LiftedEdge, LiftedProduct, LiftedSums
+from harnack.fmm.dipole_cells import DipoleCells, TreeWithCells, build_cells
+from harnack.fmm.dipole_expansion import triangle_sources
+from harnack.fmm.edge_lift import LiftedEdge, LiftedProduct
 from harnack.fmm.source_sums import SourceSums, final_rounding
 from harnack.fmm.trail_sums import RayLine, add_edge_rates, lipschitz_along
 from harnack.fmm.treecode import Treecode
@@ -132,21 +132,11 @@ IsAhead: TypeAlias = "Callable[[list[Real], Real], Mask]"
 _PER_SPHERE = 1 / (4 * math.pi)
 
 
-@dataclass(frozen=True)
-class TreeWinding:
+class TreeWinding(TreeWithCells):
     """The winding number w of a mesh on a backend, evaluated by a tree over its triangles, in units
     in which the mesh has a size of about one. The accuracy scale of a sample is a factor: the
     larger it is, the more accurate the sample.
-
-    clusters: the tree, which sums far clusters of triangles by their moments and visits near
-        triangles.
-    rounding: a bound of the rounding of w that the final operations cause.
-    cells: FMM cells for values and gradients; None for no cells.
     """
-
-    clusters: Treecode
-    rounding: Real
-    cells: DipoleCells | None = None
 
     @classmethod
     def of(
@@ -185,18 +175,6 @@ class TreeWinding:
         """Whether samples at small accuracy scales take less time. It is true for a tree."""
         return True
 
-    @property
-    def backend(self) -> Backend:
-        """The backend on which the tree lies."""
-        return self.clusters.backend
-
-    @property
-    def coarsest_detail(self) -> float:
-        """The smallest accuracy scale that makes a difference: at smaller scales samples are the
-        same (`VariableAccuracy.coarsest`). With FMM cells it is 1, up to which samples come from
-        the cells."""
-        return self.clusters.coarsest_accuracy if self.cells is None else 1.0
-
     def values(self, x: Vec3, derivatives: int, closer: Real) -> PointValues:
         """The winding number w and its derivatives up to order `derivatives` at points x (3, n),
         with error bounds. Near triangles add their crossings with the rays from x along z, and
@@ -215,10 +193,10 @@ class TreeWinding:
             del row
             return t > 0
 
-        sums = self._sums(VerticalRayFrame(x), x, detail, unit, is_ahead, derivatives)
+        sums = self._winding_sums(VerticalRayFrame(x), x, detail, unit, is_ahead, derivatives)
         return self.clusters.values(sums, _PER_SPHERE, unit, self.rounding)
 
-    def _sums(
+    def _winding_sums(
         self,
         frame: RayFrame | VerticalRayFrame,
         x: Vec3,
@@ -240,7 +218,7 @@ class TreeWinding:
         active_lanes: the mask of the lanes on which sums are wanted.
         """
         # Angles of edges are added as the argument of a product of complex factors.
-        start = LiftedProduct.identity(self.backend.Float).parts()
+        no_factors = LiftedProduct.identity(self.backend.Float)
 
         def adder(reach: Real) -> AddPrimitive:
             """Make the function that adds a near triangle to sums at points x of the rays `frame`,
@@ -257,43 +235,17 @@ class TreeWinding:
                 # A crossing is a full turn of the product, which counts them without rounding.
                 re, im, turns = state
                 turns = turns + dr.select(active & is_ahead(row, t), sign, 0)
-                lifted = LiftedSums(sums, LiftedProduct(re, im, turns))
+                product = LiftedProduct(re, im, turns)
                 for edge in edges_of(row, x, frame):
-                    lifted = lifted.add_edge(edge.edge, unit, active & edge.is_open(reach))
-                return lifted.sums, lifted.product.parts()
+                    is_open = active & edge.is_open(reach)
+                    sums, product = edge.edge.add_to(sums, product, unit, is_open)
+                return sums, product.to_state()
 
             return add
 
-        sums, product = self._near_sums(x, detail, adder, start, active_lanes, derivatives)
-        return LiftedSums(sums, LiftedProduct(*product)).total()
-
-    def _near_sums(
-        self, x: Vec3, detail: Real, adder: Callable[[Real], AddPrimitive], state: tuple[Any, ...],
-        active_lanes: Mask, derivatives: int = 1,
-    ) -> tuple[SourceSums, tuple[Any, ...]]:  # fmt: skip
-        """Sums at points x over far clusters, to which the caller's function adds near triangles.
-        The sums come from the tree, or from the FMM cells if there are cells and no second
-        derivatives are requested. The cells are used on lanes on which x is in the cells' cube and
-        the accuracy scale `detail` is at most 1.
-
-        adder: a function that makes the function that adds a near triangle. Its argument is the
-            number of radii beyond which nodes are far.
-        state: a further state of the caller, which the made function updates.
-        active_lanes: the mask of the lanes on which sums are wanted.
-        derivatives: 0 for the value, 1 with the gradient, 2 with the Hessian. If there are cells, 0
-            counts as 1.
-
-        Returns the sums and the caller's last state.
-        """
-        if self.cells is None or derivatives == 2:
-            add = adder(self.clusters.acceptance_ratio(detail))
-            return self.clusters.sums(x, detail, add, state, active_lanes, derivatives=derivatives)
-        # Two functions that add near triangles. In a cell, triangles are far beyond TRIANGLE_RATIO
-        # times their size. On lanes whose sums come from the tree, `sums_with_tree` raises the
-        # accuracy scale to at least 1 (x may be outside of the cube at a smaller scale).
-        acceptance = self.clusters.acceptance_ratio(fmax(detail, self.backend.Float(1)))
-        adders = adder(self.backend.Float(TRIANGLE_RATIO)), adder(acceptance)
-        return self.cells.sums_with_tree(self.clusters, x, detail, adders, state, active_lanes)
+        start = no_factors.to_state()
+        sums, product = self.sums(x, detail, adder, start, active_lanes, derivatives)
+        return no_factors.with_state(product).add_angle_to(sums)
 
     def crossings_ahead(self, frame: RayFrame, t: Real, active: Mask) -> Real:
         """Always 0, whatever `frame` and t are. The crossings of rays with triangles need not be
@@ -337,7 +289,7 @@ class TreeWinding:
             number = index(fmax(row[NUMBER_COLUMN], self.backend.Float(0)))
             return ~((t < behind.t) | ((t == behind.t) & (number <= behind.facet)))
 
-        sums = self._sums(frame, x, detail, unit, is_ahead, 1, active)
+        sums = self._winding_sums(frame, x, detail, unit, is_ahead, 1, active)
         # 8 * unit bounds the rounding of points of the line.
         line = RayLine(x, frame.d, 8 * unit)
         bounds_along = lipschitz_along(
@@ -382,9 +334,7 @@ class TreeWinding:
 
             start = tuple(self.backend.Float(0) for _ in lengths)
             # Accuracy scale 0: the coarsest sums are enough for bounds.
-            far_sums, edge_rates = self._near_sums(
-                line.x, self.backend.Float(0), adder, start, active
-            )
+            far_sums, edge_rates = self.sums(line.x, self.backend.Float(0), adder, start, active)
             # Add the bounds of the far clusters; this makes the bounds infinite on other lanes.
             # `line.slack` bounds the rounding of points of the line.
             return far_sums.add_line_rates(line.v, line.slack, lengths, edge_rates, active)
