@@ -135,17 +135,17 @@ def name_aliases(
     return next(plain), next(plain)
 
 
-def skip_default_sample_ray(
+def skip_derived_methods(
     app: Any, what: str, name: str, thing: Any, skip: bool, options: Any
 ) -> bool | None:
-    """Leave out the `sample_ray` of `Field` where other classes hold it: `Field` sets it in those
-    that define `evaluate`. Its own entry also lists what it inherits."""
-    is_default = thing is harnack.Field.sample_ray
-    return True if is_default and not options.inherited_members else None
+    """Leave out what `Field` has made for a class that defines only one of `evaluate` and
+    `evaluator`: the other of the two. The entry of `Field` also lists what it inherits."""
+    is_derived = getattr(thing, "is_derived", False) or thing is harnack.Field.evaluator
+    return True if is_derived and not options.inherited_members else None
 
 
 def setup(app: Any) -> None:
-    app.connect("autodoc-skip-member", skip_default_sample_ray)
+    app.connect("autodoc-skip-member", skip_derived_methods)
     app.connect("autodoc-process-signature", name_aliases)
     app.connect("source-read", add_contents)
     app.connect("build-finished", add_index)

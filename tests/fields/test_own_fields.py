@@ -423,6 +423,30 @@ def test_what_evaluator_must_return_is_said(evaluator: Any, message: str, use: A
         use(returning(evaluator))
 
 
+class Bent(Field):
+    """|p|^2: its gradient changes by twice the way. share: of that, what its evaluator says."""
+
+    def __init__(self, share: float) -> None:
+        self.share = share
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(dr.squared_norm(p), 2 * p, (TaylorRemainder(2.0),))
+
+    def evaluator(self, backend: Any, plan: Any = None) -> Any:
+        class BentEvaluator(hk.fields.SampleEvaluator):
+            def gradient_change_bound(self, p: Any, radius: Any) -> Any:
+                return 2 * self.field.share * radius
+
+        return BentEvaluator(self, backend)
+
+
+def test_a_bound_of_the_gradients_change_is_tried() -> None:
+    """Meshes are proved by it; a tenth of it was called right."""
+    check_field(Bent(1.0))
+    with pytest.raises(BrokenPromiseError, match="gradient_change_bound: the gradient changes by"):
+        check_field(Bent(0.1))
+
+
 def test_traits_of_another_type_are_refused() -> None:
     kind = type("Own", (Twice,), {"traits": {"has_jumps": True}})
     with pytest.raises(TypeError, match=r"the traits of Own are .*harnack.fields.Traits\("):

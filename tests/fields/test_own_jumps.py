@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import drjit as dr
+import numpy as np
 import pytest
 
 import harnack as hk
@@ -144,8 +145,20 @@ class Unseen(Plane):
         return super().next_crossing(o, d, after, t_max, active & False)
 
 
+class WithDistance(Plane):
+    factor = 1.0
+
+    def distance(self, p: Any) -> Any:
+        return self.factor * dr.abs(p.x) * (1 - 4 * dr.epsilon(type(p.x)))
+
+
+class TooFar(WithDistance):
+    factor = 1.5
+
+
 def test_right_jumps_pass() -> None:
     check_field(Step(Plane()), count=100, directions=2)
+    check_field(Step(WithDistance()), count=100, directions=2)
 
 
 @pytest.mark.parametrize(
@@ -162,12 +175,68 @@ def test_right_jumps_pass() -> None:
         (NotANumber, "NotANumber.next_crossing: t, facet and jump must be a number"),
         (Repeated, "Repeated.next_crossing: the crossing is not after the crossing `after`"),
         (Unseen, "Unseen.continuation is not f in front of the first crossing"),
+        (TooFar, "TooFar.distance is longer than a way to a facet"),
     ],
 )
 def test_wrong_jumps_are_found(plane: type[Jumps], message: str) -> None:
     """Most of them were not, although `trace` missed hits."""
     with pytest.raises(BrokenPromiseError, match=message):
         check_field(Step(plane()))
+
+
+def test_traits_that_say_other_than_the_evaluator_are_refused() -> None:
+    """`check_field` raised an AssertionError without a text."""
+
+    class NoJumps(Step):
+        def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+            return SampleEvaluator(self, backend)
+
+    for use in (check_field, lambda field: hk.trace(field, [[0.0, 0, 3]], [[0.0, 0, -1]])):
+        with pytest.raises(TypeError, match=r"traits of NoJumps say has_jumps=True, and its eval"):
+            use(NoJumps(Plane()))
+
+
+def test_a_smooth_part_beside_a_facet_is_nearest() -> None:
+    """The facet's point was taken, 0.053 away, and the sphere is 0.0097 away."""
+
+    class Steps(Field):
+        """|p| - 1, and 0.25 more for x > -0.3."""
+
+        domain = hk.Ball(radius=2.0)
+        traits = hk.fields.Traits(has_jumps=True)
+
+        def evaluate(self, p: Any) -> Sample:
+            return Shell(dr.select(p.x > -0.3, type(p.x)(0.25), 0)).evaluate(p)
+
+        def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+            return SampleEvaluator(self, backend, jumps=AtX())
+
+    class AtX(Jumps):
+        def next_crossing(
+            self, o: Any, d: Any, after: Any, t_max: Any, active: Any
+        ) -> JumpCrossing:
+            t, index = (-0.3 - o.x) / d.x, dr.uint32_array_t(o.x)
+            is_met = active & (d.x != 0) & (t > after.t) & (t <= t_max)
+            return JumpCrossing(
+                dr.select(is_met, t, dr.inf),
+                dr.select(is_met, index(0), index(NO_FACET)),
+                dr.select(is_met, dr.copysign(type(t)(0.25), d.x), 0),
+                type(o)(1, 0, 0),
+            )
+
+        def initial_offset(self, o: Any, d: Any, t_min: Any, active: Any) -> Any:
+            x = o.x + t_min * d.x
+            is_beyond = (x > -0.3) | ((x == -0.3) & (d.x > 0))
+            return dr.select(is_beyond, type(x)(0.25), 0)
+
+        def continuation(self, o: Any, d: Any, behind: Any, ahead: Any, offset: Any) -> Any:
+            return EvaluateOnly(Shell(offset).evaluate)
+
+        def distance(self, p: Any) -> Any:
+            return dr.abs(p.x + 0.3) * (1 - 4 * dr.epsilon(type(p.x)))
+
+    x = np.array([[-0.35266, -0.40087, 0.83405]])
+    assert hk.signed_distance(Steps(), x) == pytest.approx(np.linalg.norm(x) - 1, abs=1e-9)
 
 
 def test_other_types_are_refused_by_name() -> None:

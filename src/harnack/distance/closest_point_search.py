@@ -167,6 +167,8 @@ def _find_sorted(
     smooth = None if jumps is None or surface.clip_volume is not None else jumps.smooth_field()
     if smooth is None:
         result = search(surface, x, InitialGuess(guess, estimate), query, tolerance, progress)
+        if jumps is not None:
+            result.closest = _with_points_between_jumps(query, x, result.closest)
     else:
         result = _search_smooth_part(
             query, smooth, x, InitialGuess(guess, estimate), tolerance, progress
@@ -218,6 +220,31 @@ def _with_gradient_feet(
     is_nearer = _length(points[rows] - feet) < np.nan_to_num(distance[rows], nan=np.inf)
     closest = closest.copy()
     closest[rows[is_nearer]] = feet[is_nearer]
+    return closest
+
+
+def _with_points_between_jumps(
+    query: _Query, points: FloatArray, closest: FloatArray
+) -> FloatArray:
+    """Return the closest points of queries for a function that jumps, replaced where the gradient
+    leads to a nearer point. The search in cells begins at a single point of each cell, and a facet
+    may pass between that point and the query.
+
+    Where f, sampled at a point, equals the level, the point is on the surface, whatever facets are
+    near. From there a compass search leads to a point that is nearer still.
+
+    points, closest: (n, 3) the queries, and their closest points so far, NaN for none.
+    """
+    feet = query.gradient_feet(points)
+    distance = np.nan_to_num(_length(points - closest), nan=np.inf)
+    rows = np.flatnonzero(_length(points - feet) < distance)
+    if not len(rows):
+        return closest
+    closest = closest.copy()
+    closest[rows] = feet[rows]
+    nearer, _ = query.descend(points[rows], feet[rows], np.full(len(rows), np.inf))
+    is_nearer = _length(points[rows] - nearer) < _length(points[rows] - feet[rows])
+    closest[rows[is_nearer]] = nearer[is_nearer]
     return closest
 
 

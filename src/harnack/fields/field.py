@@ -669,6 +669,22 @@ def check_is_field(value: Any) -> None:
     check_volume(value.domain, f"the domain of {with_article(type(value).__name__)}")
 
 
+def checked_evaluator(field: Field, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+    """The evaluator of a field. Raises TypeError if it has jumps or patches and the traits of the
+    field say that it has none, or the other way round."""
+    evaluator = field.evaluator(backend, plan)
+    for name, is_stated, capability in (
+        ("jumps", field.traits.has_jumps, evaluator.jumps),
+        ("patches", field.traits.has_patches, evaluator.patches),
+    ):
+        if is_stated != (capability is not None):
+            raise TypeError(
+                f"the traits of {type(field).__name__} say has_{name}={is_stated}, and its "
+                f"evaluator has {'no ' if is_stated else ''}{name}"
+            )
+    return evaluator
+
+
 def suggest_field(value: Any) -> str:
     """The end of an error message about an object, `value`, that is given in place of a field: what
     kind of object it is, and how to make a field of it."""

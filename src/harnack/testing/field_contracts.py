@@ -30,7 +30,7 @@ from harnack.enclosures.samples import Ray
 from harnack.fields.analytic.riemann_surface import RiemannSurface
 from harnack.fields.batched_fields import BatchedField
 from harnack.fields.evaluator import Evaluator
-from harnack.fields.field import Field, check_is_field
+from harnack.fields.field import Field, check_is_field, checked_evaluator
 from harnack.testing.branch_contracts import check_branch_points
 from harnack.testing.derivative_contracts import check_derivatives
 from harnack.testing.jump_contracts import check_jumps
@@ -211,9 +211,10 @@ def check_field(
         BrokenPromiseError: naming the promise and the point where it is broken.
         ValueError: none of the points lies in the field's domain.
         TypeError: `evaluate` returns something else than a `Sample`; or a method of `Jumps`
-            something else than it should.
+            something else than it should; or `traits` and evaluator differ.
     """
     check_is_field(field)
+    checked_evaluator(field, choose_backend("double"))
     generator = np.random.default_rng(rng)
     # Check and convert the arguments.
     count, directions = (
@@ -253,6 +254,7 @@ def check_field(
             check_ray_samples(field, points, rng=generator, precision=precision)
     for level in levels:
         _check_extent(field, level, generator, count)
+    _check_gradient_change(field, points, generator)
 
 
 def _overrides_sample_ray(field: Field) -> bool:
@@ -382,6 +384,36 @@ def _check_differentiable_value(field: Field, points: FloatArray, samples: Field
     is_right = error <= 1e-6 * size + 2 * samples.gradient_error + gradient_error
     message = "differentiable_value does not have the gradient as its derivative, in reverse mode"
     require(is_right, message, points, error)
+
+
+def _check_gradient_change(field: Field, points: FloatArray, rng: np.random.Generator) -> None:
+    """Check `Evaluator.gradient_change_bound` at points (n, 3), for random radii and at random
+    points of the balls: the gradient there may differ from that at the point by no more than the
+    bound. Fields with jumps or patches do not count. Raises a BrokenPromiseError if it differs by
+    more.
+    """
+    if field.traits.has_jumps or field.traits.has_patches:
+        return
+    backend = choose_backend("double")
+    # Radii from 1e-4 of the size of the points to all of it.
+    radius = np.ptp(points) * 10 ** rng.uniform(-4, 0, len(points))
+    # Up to the domain's end, outside of which the bound need not hold.
+    directions = random_directions(rng, len(points))
+    length = rng.uniform(0, 1, len(points)) ** (1 / 3) * radius
+    length = np.minimum(length, distance_to_exit(field, points, directions))
+    evaluator = field.evaluator(backend)
+    p, r = to_vector3(backend, points), backend.Float(radius)
+    bound = to_numpy(evaluator.gradient_change_bound(p, r) + 0 * r)
+    is_known = np.isfinite(bound)
+    if not is_known.any():
+        return
+    there = points + length[:, None] * directions
+    start, end = sample_field(field, points), sample_field(field, there)
+    change = np.linalg.norm(end.gradient - start.gradient, axis=1)
+    size = np.linalg.norm(start.gradient, axis=1) + np.linalg.norm(end.gradient, axis=1)
+    allowed = bound + start.gradient_error + end.gradient_error + 1e-9 * size
+    message = "gradient_change_bound: the gradient changes by more than the bound"
+    require((change <= allowed) | ~is_known, message, points, change - bound, there)
 
 
 def _check_promise(

@@ -57,6 +57,7 @@ def check_jumps(field: Field, points: FloatArray, rng: np.random.Generator) -> N
     - Between two crossings `continuation` has the values of f, if it gets `initial_offset` plus the
       jumps since the start. At both ends it has the limit of f, so that from one interval to the
       next it changes by the jump.
+    - `distance`, where it is defined, is at most the length of each ray up to its first crossing.
     - f keeps on the interval what samples of the continuation promise (proved bounds of f near a
       point).
 
@@ -72,6 +73,8 @@ def check_jumps(field: Field, points: FloatArray, rng: np.random.Generator) -> N
         return
     rays = _random_rays(field, points, rng)
     crossings = _follow_crossings(jumps, rays)
+    if jumps.gives_distances:
+        _check_distance(jumps, rays, crossings[1])
     for _ in range(_RESTARTS):
         _check_restart(jumps, rays, crossings, rng)
     if not jumps.takes_all_levels:
@@ -189,6 +192,19 @@ def _follow_crossings(jumps: Jumps, rays: _Rays) -> list[_Crossings]:
         active = now.is_found
         crossings.append(now)
     return crossings
+
+
+def _check_distance(jumps: Jumps, rays: _Rays, first: _Crossings) -> None:
+    """Check that `Jumps.distance` at the starts of rays is no longer than the way to the first
+    crossing, `first`. Raises a BrokenPromiseError if it is."""
+    backend = choose_backend("double")
+    start = rays.point(rays.start)
+    distance = to_numpy(jumps.distance(to_vector3(backend, start)) + 0 * backend.Float(rays.start))
+    length = first.t - rays.start
+    excess = np.where(first.is_found, distance - length, 0.0)
+    allowed = 1e-9 * (np.abs(length) + np.abs(start).max(axis=1))
+    message = f"{type(jumps).__name__}.distance is longer than a way to a facet"
+    require(~(excess > allowed), message, start, excess)
 
 
 def _check_crossings(name: str, rays: _Rays, before: _Crossings, now: _Crossings) -> None:

@@ -20,6 +20,7 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.validation import check_length_range
 from harnack.enclosures import EnclosureKinds, Levels, choose_enclosures
 from harnack.fields.evaluator import Plan
+from harnack.fields.field import checked_evaluator
 from harnack.fields.parameters import differentiable_parameters
 from harnack.geometry import ConvexHull
 from harnack.name_suggestions import with_article
@@ -248,22 +249,7 @@ class TracedSurface:
         parameters = differentiable_parameters(self.field)
         has_derivatives = any(map(dr.grad_enabled, parameters))
         key, plan = ("evaluator", backend, self.ray_count, has_derivatives), self.plan
-        return self.memoize(key, lambda: self._checked(self.field.evaluator(backend, plan)))
-
-    def _checked(self, evaluator: Evaluator) -> Evaluator:
-        """Return an evaluator of the field. Raises TypeError if it has jumps or patches and the
-        traits of the field say that it has none, or the other way round."""
-        traits = self.field.traits
-        for name, is_stated, capability in (
-            ("jumps", traits.has_jumps, evaluator.jumps),
-            ("patches", traits.has_patches, evaluator.patches),
-        ):
-            if is_stated != (capability is not None):
-                raise TypeError(
-                    f"the traits of {type(self.field).__name__} say has_{name}={is_stated}, and "
-                    f"its evaluator has {'no ' if is_stated else ''}{name}"
-                )
-        return evaluator
+        return self.memoize(key, lambda: checked_evaluator(self.field, backend, plan))
 
     @property
     def plan(self) -> Plan:
