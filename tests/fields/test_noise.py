@@ -6,12 +6,14 @@ import itertools
 import math
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
 import harnack as hk
-from harnack.backend import choose_backend
+from harnack.backend import choose_backend, to_numpy
 from harnack.fields.solids.fractal import CONSTANTS, CORNERS, cell_noise, fade, lattice_vector
+from harnack.tracer.traced_surface import traced_surface
 
 FADES = pytest.mark.parametrize("kind", ["cubic", "quintic"])
 ATTAINED = {"cubic": math.sqrt(19) / 2, "quintic": math.sqrt(499) / 8}
@@ -173,3 +175,15 @@ def test_nothing_is_claimed_where_the_lattice_is_finer_than_numbers() -> None:
     """Rays from there run out of steps; they do not miss."""
     hits = hk.trace(hk.solids.Noise(1e12), [[0.0, 0.0, 1e3]], [[0.0, 0.0, 1.0]], t_max=1.0)
     assert hits.status[0] == int(hk.RayStatus.OUT_OF_STEPS)
+
+
+def test_two_batches_of_rays_have_different_sizes() -> None:
+    """The constant of the displaced solid took the size of the first: incompatible sizes."""
+    solid = hk.solids.DisplacedSolid(hk.Sphere(1.0), hk.solids.FractalNoise(3, amplitude=0.2))
+    backend = choose_backend("single")
+    tracer = traced_surface(solid, level=0.0).tracer(backend)
+    for n in (50, 90):
+        o = backend.Array3f(dr.linspace(backend.Float, -0.5, 0.5, n), 0, 3)
+        hit = tracer.first_hit(o, backend.Array3f(0, 0, -1), 0, np.inf)
+        assert dr.width(hit.t) == n
+        assert (to_numpy(hit.status) == hk.RayStatus.HIT).all()

@@ -682,6 +682,8 @@ def checked_evaluator(field: Field, backend: Backend, plan: Plan = POINTS) -> Ev
                 f"the traits of {type(field).__name__} say has_{name}={is_stated}, and its "
                 f"evaluator has {'no ' if is_stated else ''}{name}"
             )
+    # Numbers that are still to be computed would be computed by the lanes of the next kernel.
+    dr.eval(*(value for value in vars(evaluator).values() if dr.is_array_v(type(value))))
     return evaluator
 
 

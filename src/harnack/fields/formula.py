@@ -158,6 +158,12 @@ class FormulaEvaluator(Evaluator):
     formula: FormulaFunction
     lipschitz: Real | None
 
+    def __post_init__(self) -> None:
+        """Compute a constant that is a sum of numbers of the backend. A kernel that is recorded
+        would compute it for each of its lanes, and keep that as the number."""
+        if dr.is_array_v(type(self.lipschitz)):
+            dr.eval(self.lipschitz)
+
     @property
     def name(self) -> str:
         """The name of the field's class, for messages."""
