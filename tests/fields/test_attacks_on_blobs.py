@@ -263,7 +263,7 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     p, d = (one.astype(backend.dtype).astype(np.float64) for one in (p, d))
     knots = [0.0, backend.Float(1e-9), backend.Float(2e-9)]
     on_backend: Any = f.evaluator(backend).function
-    found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
+    ranges_along = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     v = p[:, None] - f.points
     r = np.linalg.norm(v, axis=-1)
     along = (v * d[:, None]).sum(-1)
@@ -272,7 +272,7 @@ def test_slopes_of_hrbf_on_short_pieces(precision: Any, offset: float) -> None:
     slope = 3 * f.value_coefficients * r * along + (v * b).sum(-1) * along / r + r * (d @ b.T)
     slope = slope.sum(1)
     tiny = 1e-13 * (1 + np.abs(slope)) if precision == "single" else 0.0
-    for part in found.parts:
+    for part in ranges_along.parts:
         low, high = (
             to_numpy(end).astype(np.float64)
             for end in (part.slope_range.lower, part.slope_range.upper)

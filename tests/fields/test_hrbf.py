@@ -35,9 +35,11 @@ def test_values_and_derivatives_are_those_of_the_formula() -> None:
     backend = choose_backend("double")
     evaluator = f.evaluator(backend)
     p = to_vector3(backend, np.random.default_rng(0).uniform(-1.3, 1.3, (300, 3)))
-    one, two = evaluator.evaluate(p), FormulaEvaluator.evaluate(evaluator, p)
-    np.testing.assert_allclose(to_numpy(one.value), to_numpy(two.value), atol=1e-11)
-    np.testing.assert_allclose(to_numpy(one.gradient), to_numpy(two.gradient), atol=1e-11)
+    by_tree, by_formula = evaluator.evaluate(p), FormulaEvaluator.evaluate(evaluator, p)
+    np.testing.assert_allclose(to_numpy(by_tree.value), to_numpy(by_formula.value), atol=1e-11)
+    np.testing.assert_allclose(
+        to_numpy(by_tree.gradient), to_numpy(by_formula.gradient), atol=1e-11
+    )
     for a, b in zip(evaluator.hessian(p), FormulaEvaluator.hessian(evaluator, p), strict=True):
         np.testing.assert_allclose(to_numpy(a), to_numpy(b), atol=1e-11)
 
@@ -72,10 +74,10 @@ def test_ranges_hold_and_are_attained(precision: Any) -> None:
     length = (rng.random(count) * 3).astype(backend.dtype).astype(np.float64)
     knots = [0.0, backend.Float(0.4 * length), backend.Float(length)]
     on_backend: Any = f.evaluator(backend).function
-    found = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
+    ranges_along = on_backend.along(to_vector3(backend, p), to_vector3(backend, d), knots)
     ends = [0 * length, *(to_numpy(one).astype(np.float64) for one in knots[1:])]
     width: list[Any] = []
-    for k, part in enumerate(found.parts):
+    for k, part in enumerate(ranges_along.parts):
         s = ends[k][:, None] + np.linspace(0, 1, 200) * (ends[k + 1] - ends[k])[:, None]
         x = (p[:, None] + s[..., None] * d[:, None]).reshape(-1, 3)
         gradient = f.gradient(x, precision="double").reshape(count, -1, 3)

@@ -385,10 +385,10 @@ def test_cells_do_not_depend_on_how_many_are_made_at_once(monkeypatch: pytest.Mo
 def test_very_many_rays_get_smaller_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dipole, "_LEAST_RAYS", 1000)
     field = hk.DipolePotential(*cloud(600))
-    some, many = field.cell_choice(5000), field.cell_choice(60 * 600)
-    assert some != many
-    assert field.cell_choice(10**9) == many
-    assert field.cell_choice(6000) == some
+    of_few_rays, of_many_rays = field.cell_choice(5000), field.cell_choice(60 * 600)
+    assert of_few_rays != of_many_rays
+    assert field.cell_choice(10**9) == of_many_rays
+    assert field.cell_choice(6000) == of_few_rays
     counts: list[int] = []
     requested = hk.DipolePotential(*cloud(600), cells=True)
     for each, count in ((field, 5000), (field, 60 * 600), (requested, 0)):

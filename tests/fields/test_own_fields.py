@@ -16,11 +16,13 @@ import numpy as np
 import pytest
 
 import harnack as hk
+from harnack.backend import choose_backend
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder, choose_enclosures
 from harnack.enclosures.selection import ENCLOSURE_NAMES
 from harnack.fields import Field, Sample
 from harnack.geometry import example_curves
 from harnack.testing import BrokenPromiseError, check_field
+from harnack.tracer.traced_surface import traced_surface
 
 P = np.array([[0.5, 0.0, 0.0]])
 RAY = (np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]))
@@ -350,13 +352,13 @@ def test_values_are_those_of_an_overridden_evaluate(kind: Any, arguments: Any) -
             return doubled(super().evaluate(p))
 
     options = getattr(kind, "keywords", {})
-    own, field = Own(*arguments, **options), kind(*arguments)
+    derived, field = Own(*arguments, **options), kind(*arguments)
     points = np.array([[0.3, 0.2, 0.5], [0.7, -0.4, 0.3]])
     for name in ("value", "gradient"):
         expected = 2 * getattr(field, name)(points)
-        np.testing.assert_allclose(getattr(own, name)(points), expected, rtol=1e-2)
+        np.testing.assert_allclose(getattr(derived, name)(points), expected, rtol=1e-2)
     with pytest.raises(NotImplementedError, match="define its method hessian"):
-        own.hessian(points)
+        derived.hessian(points)
 
 
 class Larger(hk.Sphere):
@@ -445,6 +447,34 @@ def test_a_bound_of_the_gradients_change_is_tried() -> None:
     check_field(Bent(1.0))
     with pytest.raises(BrokenPromiseError, match="gradient_change_bound: the gradient changes by"):
         check_field(Bent(0.1))
+
+
+class Grown(Field):
+    """|p| - 1, with a radius that its evaluator adds up on the backend."""
+
+    def evaluator(self, backend: Any, plan: Any = None) -> Any:
+        return GrownEvaluator(backend)
+
+
+class GrownEvaluator(hk.fields.Evaluator):
+    def __init__(self, backend: Any) -> None:
+        self.radius = dr.opaque(backend.Float, 0.75) + dr.opaque(backend.Float, 0.25)
+
+    def evaluate(self, p: Any) -> Sample:
+        return Sample(dr.norm(p) - self.radius, p / dr.norm(p), (Lipschitz(1.0),))
+
+
+def test_numbers_of_evaluators_are_computed_before_rays() -> None:
+    """The sum took the size of the first batch: incompatible sizes. Also inside of a solid."""
+    for field in (Grown(), hk.solid(Grown(), below=0) | hk.Sphere(0.5)):
+        surface = hk.Surface(field, clip=hk.Ball(radius=2.0))
+        backend = choose_backend("single")
+        tracer = traced_surface(surface).tracer(backend)
+        for n in (50, 90):
+            o = backend.Array3f(dr.linspace(backend.Float, -0.5, 0.5, n), 0, 3)
+            hit = tracer.first_hit(o, backend.Array3f(0, 0, -1), 0, np.inf)
+            assert dr.width(hit.t) == n
+            assert (np.array(hit.status) == hk.RayStatus.HIT).all()
 
 
 def test_traits_of_another_type_are_refused() -> None:

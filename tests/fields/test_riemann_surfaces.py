@@ -396,8 +396,10 @@ def test_second_derivatives_on_stretches_and_disks(branches: Branches, sharpest:
         return complex_number(*(backend.Float(one) for one in parts))
 
     def second(points: np.ndarray) -> np.ndarray:
-        found = evaluator.evaluate(upload(points.ravel()))
-        return np.max([to_numpy(abs(one.second)) for one in found], axis=0).reshape(points.shape)
+        branches = evaluator.evaluate(upload(points.ravel()))
+        return np.max([to_numpy(abs(branch.second)) for branch in branches], axis=0).reshape(
+            points.shape
+        )
 
     start, way, ahead = upload(z), upload(w), backend.Float(length)
     bound = to_numpy(

@@ -357,8 +357,8 @@ def test_where_a_value_is_known_from_the_middle_of_a_cell_it_is_right(
     ])  # fmt: skip
     points = points.astype(backend.dtype).astype(np.float64)
     x = to_vector3(backend, points)
-    found = modulo_one.value_if_cheap(x, backend.Float(0), backend.Bool(True))
-    value = to_numpy(found).astype(np.float64)
+    known_value = modulo_one.value_if_cheap(x, backend.Float(0), backend.Bool(True))
+    value = to_numpy(known_value).astype(np.float64)
     known = np.isfinite(value)
     assert known[:n].mean() > 0.9
     if np.abs(points).max() < 10:  # else rounding moves points off faces

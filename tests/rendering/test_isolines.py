@@ -138,9 +138,9 @@ def test_the_last_of_several_lines_covers_the_others() -> None:
     points, normals = around_cylinder(5000)
     lines = [hk.Isolines("z", [0.0], width=1.0), hk.Isolines("x", [0.0], width=0.5)]
     p, n = upload_vectors(BACKEND, points), upload_vectors(BACKEND, normals)
-    prepared = tuple(one.upload(BACKEND, 1.0) for one in lines)
-    number = to_numpy(isoline_index_at(prepared, p, n, BACKEND.UInt32))
-    first, second = (covered(one, points, normals) for one in lines)
+    uploaded = tuple(isolines.upload(BACKEND, 1.0) for isolines in lines)
+    number = to_numpy(isoline_index_at(uploaded, p, n, BACKEND.UInt32))
+    first, second = (covered(isolines, points, normals) for isolines in lines)
     assert (first & second).any()
     np.testing.assert_array_equal(number, np.where(second, 2, np.where(first, 1, 0)))
 

@@ -114,12 +114,14 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 def test_a_moved_mesh_has_cells_of_its_own() -> None:
     field = broken(2)
-    one = field.occupied_cells_of(hk.fields.Plan((0.5,)))
-    other = field.with_vertices(field.mesh.vertices * 2).occupied_cells_of(hk.fields.Plan((0.5,)))
-    assert one is not None
-    assert other is not None
-    assert other.cell_size == pytest.approx(2 * one.cell_size, rel=1e-3)
-    assert field.occupied_cells_of(hk.fields.Plan((0.5,))) is one
+    cells = field.occupied_cells_of(hk.fields.Plan((0.5,)))
+    cells_of_moved = field.with_vertices(field.mesh.vertices * 2).occupied_cells_of(
+        hk.fields.Plan((0.5,))
+    )
+    assert cells is not None
+    assert cells_of_moved is not None
+    assert cells_of_moved.cell_size == pytest.approx(2 * cells.cell_size, rel=1e-3)
+    assert field.occupied_cells_of(hk.fields.Plan((0.5,))) is cells
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

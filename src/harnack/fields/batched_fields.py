@@ -244,16 +244,12 @@ def _values_of_samples(
         NotImplementedError: the class does not define `hessian`.
     """
     del closer
-    sample = self.evaluator(backend_of(x)).evaluate(x)
-    hessian = None
+    evaluator = self.evaluator(backend_of(x))
+    sample, hessian = evaluator.evaluate(x), None
     if derivatives == 2:
-        if type(self).hessian is BatchedField.hessian:
-            raise NotImplementedError(
-                f"{type(self).__name__} gives no second derivatives: define its method "
-                "hessian(p), or ask for what needs none, such as signed_distance(..., "
-                'method="first_order")'
-            )
-        first, second, third = self.hessian(x)
+        # The `hessian` of the base class would ask for these values again.
+        is_defined = type(self).hessian is not BatchedField.hessian
+        first, second, third = self.hessian(x) if is_defined else Evaluator.hessian(evaluator, x)
         hessian = SymmetricMatrix(first.x, second.y, third.z, first.y, first.z, second.z)
     error = value_error_bound(sample, 0 * x.x, 0 * x.x)  # without the rounding of x
     return PointValues(

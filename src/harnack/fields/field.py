@@ -198,7 +198,7 @@ class Field(Parametrized, abc.ABC):
                 setattr(cls, name, classmethod(checked_maker))
         defines_evaluator = "evaluator" in vars(cls)
         if defines_evaluator and not cls.__module__.startswith("harnack."):
-            cls.evaluator = cast("Any", _checked_evaluator(cls.evaluator))
+            cls.evaluator = cast("Any", _with_checks(cls.evaluator))
         if "evaluate" in vars(cls):
             checked: Any = validate_samples(cls.evaluate)
             cls.evaluate = checked
@@ -407,11 +407,12 @@ def _attributes(field: Field) -> dict[str, Any]:
     return vars(field) | {name: getattr(field, name) for name in slots if hasattr(field, name)}
 
 
-def _checked_evaluator(
+def _with_checks(
     evaluator: Callable[[Any, Backend, Plan], Evaluator],
 ) -> Callable[[Any, Backend, Plan], Evaluator]:
     """The method `evaluator` of a user's class, which raises a TypeError if it does not take a
-    backend and a plan, or returns no evaluator. The plan may be left out of calls."""
+    backend and a plan, or returns no evaluator. The plan may be left out of calls. Numbers that are
+    attributes of the evaluator are computed."""
 
     @functools.wraps(evaluator)
     def checked(self: Any, backend: Backend, plan: Plan = POINTS) -> Evaluator:
@@ -430,6 +431,9 @@ def _checked_evaluator(
                 "harnack.fields.Evaluator; one that calls the evaluate(p) of the field is "
                 "harnack.fields.SampleEvaluator(self, backend)"
             )
+        # Numbers that are still to be computed would be computed by the lanes of the next kernel.
+        numbers = getattr(result, "__dict__", {}).values()
+        dr.eval(*(value for value in numbers if dr.is_array_v(type(value))))
         return result
 
     return checked
@@ -498,8 +502,9 @@ class SampleEvaluator(Evaluator):
     backend: the backend.
     jumps, modulo_one, patches, variable_accuracy, is_steep: what else f can do, as of `Evaluator`.
 
-    Fields with second derivatives, or with enclosures of their own along rays, define a subclass
-    with `hessian` or `sample_ray`, and return it from `Field.evaluator`.
+    Fields with second derivatives define `hessian` beside `evaluate`. Fields with enclosures of
+    their own along rays define a subclass of this class with `sample_ray`, and return it from
+    `Field.evaluator`.
     """
 
     def __init__(
@@ -533,12 +538,8 @@ class SampleEvaluator(Evaluator):
         return self._evaluate(self.field, p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        if type(self.field).hessian is Field.hessian:
-            raise NotImplementedError(
-                f"{type(self.field).__name__} gives no second derivatives: define its method "
-                "hessian(p), or ask for what needs none, such as signed_distance(..., "
-                'method="first_order")'
-            )
+        if type(self.field).hessian is Field.hessian:  # it would ask this evaluator again
+            return super().hessian(p)
         return self.field.hessian(p)
 
     def differentiable_value(self, p: Vec3) -> Real:
@@ -682,8 +683,6 @@ def checked_evaluator(field: Field, backend: Backend, plan: Plan = POINTS) -> Ev
                 f"the traits of {type(field).__name__} say has_{name}={is_stated}, and its "
                 f"evaluator has {'no ' if is_stated else ''}{name}"
             )
-    # Numbers that are still to be computed would be computed by the lanes of the next kernel.
-    dr.eval(*(value for value in vars(evaluator).values() if dr.is_array_v(type(value))))
     return evaluator
 
 

@@ -33,7 +33,9 @@ class LoopRecord:
         record becomes a tuple, too. Sums that were not requested are None, and not arrays of zeros:
         Dr.Jit records a loop a second time if an array of its state never changes."""
         values = vars(self).values()
-        return tuple(one.to_state() if isinstance(one, LoopRecord) else one for one in values)
+        return tuple(
+            value.to_state() if isinstance(value, LoopRecord) else value for value in values
+        )
 
     def with_state(self, state: tuple[Any, ...]) -> Self:
         """The record of the same structure as this one that `to_state` turned into `state`."""
