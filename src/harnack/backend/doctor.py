@@ -18,6 +18,7 @@ from rich.text import Text
 
 from harnack._version import __version__
 from harnack.backend.arrays import BACKEND_VARIABLE, Index, Mask, Real, choose_backend, to_numpy
+from harnack.backend.atomic_library import is_stand_in_loaded
 from harnack.backend.llvm import PATH_VARIABLE, LLVMNotFoundError, find_libraries, loaded_library
 
 _PACKAGES = ("drjit", "mitsuba", "numpy", "scipy", "trimesh")
@@ -49,6 +50,7 @@ def diagnose() -> tuple[Finding, ...]:
         Finding("Python", f"{platform.python_version()} at {sys.executable}"),
         Finding("system", f"{platform.platform()}, {os.cpu_count()} cores"),
         *(_package_finding(name) for name in _PACKAGES),
+        *_atomic_findings(),
         _device_finding("CUDA", dr.JitBackend.CUDA),
         _device_finding("Metal", dr.JitBackend.Metal),
         *_llvm_findings(),
@@ -66,6 +68,13 @@ def _package_finding(name: str) -> Finding:
         return Finding(name, importlib.metadata.version(name))
     except importlib.metadata.PackageNotFoundError:
         return Finding(name, "not installed", ok=False, advice=f"pip install {name}")
+
+
+def _atomic_findings() -> list[Finding]:
+    """Return a line that says that a stand-in for libatomic is in use; none if it is not."""
+    if not is_stand_in_loaded():
+        return []
+    return [Finding("libatomic", "none on this system; our stand-in serves Dr.Jit")]
 
 
 def _device_finding(name: str, kind: Any) -> Finding:

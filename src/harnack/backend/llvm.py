@@ -13,21 +13,33 @@ functions, gradients, scatters, a Mitsuba render):
 
 So 17 is the minimum and 19 the preferred version. A version newer than 23 is used only if there is
 no other.
+
+On Linux with an x86-64 processor, the package requires `karellen-llvm-core`, a wheel that brings
+LLVM 19 into the Python environment, so nothing has to be installed on the system. No such wheel is
+known for other systems.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import mmap
 import os
 import platform
 import re
+import shlex
 import shutil
+import site
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from harnack.backend.atomic_library import provide_atomic_library
+
+LLVM_WHEEL = "'karellen-llvm-core>=19.1.7,<20'"
+"""What pip installs to bring LLVM to Linux on x86-64, as pyproject.toml requires it."""
 MINIMUM_MAJOR = 17
 PREFERRED_MAJOR = 19
 NEWEST_TRIED_MAJOR = 23
@@ -107,8 +119,12 @@ def _version_from_soname(path: Path) -> int | None:
 def _search_folders() -> Iterator[Path]:
     """Yield the folders that may hold LLVM libraries on this platform, the folders of this Python
     first."""
-    yield Path(sys.prefix) / "lib" / "native"  # where `make setup` may have unpacked one
+    # Where wheels install LLVM: into this environment, by `pip install --user`, or into the
+    # environment that this one sees by `--system-site-packages`.
     yield Path(sys.prefix) / "lib"
+    if site.ENABLE_USER_SITE:
+        yield Path(site.getuserbase()) / "lib"
+    yield Path(sys.base_prefix) / "lib"
     if "CONDA_PREFIX" in os.environ:
         yield Path(os.environ["CONDA_PREFIX"]) / "lib"
     if sys.platform == "darwin":
@@ -172,13 +188,18 @@ def import_drjit() -> None:
     """
     if "drjit" in sys.modules:
         return
-    best = None if os.environ.get(PATH_VARIABLE) else best_library()
+    provide_atomic_library()
+    requested = os.environ.get(PATH_VARIABLE)
+    best = None if requested else best_library()
     if best is not None:
         os.environ[PATH_VARIABLE] = str(best.path)
+    if requested or best:
+        _load_cpp_runtime(Path(os.environ[PATH_VARIABLE]))
     try:
         importlib.import_module("drjit")
     except (ImportError, NameError) as error:  # Dr.Jit 1.5 covers its ImportError by a NameError
         cause = error.__context__ or error
+        # The stand-in for libatomic could not be loaded, or this is no x86-64 processor.
         hint = ": on Debian and Ubuntu, `sudo apt-get install libatomic1`"
         raise ImportError(
             f"Dr.Jit cannot be imported: {cause}{hint if 'libatomic' in str(cause) else ''}"
@@ -186,6 +207,24 @@ def import_drjit() -> None:
     finally:
         if best is not None:
             del os.environ[PATH_VARIABLE]
+
+
+def _load_cpp_runtime(path: Path) -> None:
+    """Load the C++ runtime that the wheel `karellen-llvm-core` puts beside its LLVM, if it lacks
+    the links by which the dynamic linker finds it.
+
+    A wheel cannot contain links. This one makes them when Python next starts, which fails where
+    the user may not write into the environment, as in many containers.
+
+    path: of the LLVM library.
+    """
+    folder = path.parent / f"{platform.machine()}-unknown-linux-gnu"
+    for name in ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1"):  # each needs those before it
+        library = folder / f"{name}.0"
+        if library.is_file() and not (folder / name).exists():
+            # If this fails, so does loading LLVM, and `ensure_llvm` reports it.
+            with contextlib.suppress(OSError):
+                ctypes.CDLL(str(library))
 
 
 def loaded_library() -> LLVMLibrary | None:
@@ -268,17 +307,22 @@ def repair_advice() -> str:
     best = best_library()
     requested = os.environ.get(PATH_VARIABLE)
     if best is None or (requested and os.path.realpath(requested) == os.path.realpath(best.path)):
-        return f"Install LLVM {PREFERRED_MAJOR}: `{install_command()}`"
+        return f"Install LLVM {PREFERRED_MAJOR}: {install_advice()}"
     import_hint = "" if requested else "import harnack before drjit and mitsuba, or "
     return f"LLVM {best.major} is installed: {import_hint}run `export {PATH_VARIABLE}={best.path}`"
 
 
-def install_command() -> str:
-    """Return the command that installs an acceptable LLVM on this kind of system."""
+def install_advice() -> str:
+    """Return the command that installs an acceptable LLVM on this kind of system, in backquotes,
+    and what else is to be done."""
+    if sys.platform == "linux" and platform.machine() == "x86_64":
+        return f"`{shlex.quote(sys.executable)} -m pip install {LLVM_WHEEL}`"
     if "CONDA_PREFIX" in os.environ:
-        return f"conda install -c conda-forge libllvm{PREFERRED_MAJOR}"
+        return f"`conda install -c conda-forge libllvm{PREFERRED_MAJOR}`"
     if sys.platform == "darwin":
-        return f"brew install llvm@{PREFERRED_MAJOR}"
+        return f"`brew install llvm@{PREFERRED_MAJOR}`"
+    if sys.platform == "win32":
+        return f"`winget install LLVM.LLVM`, then set {PATH_VARIABLE} to its file bin\\LLVM-C.dll"
     if shutil.which("dnf"):
-        return "sudo dnf install llvm-libs"
-    return f"sudo apt-get install libllvm{PREFERRED_MAJOR}"
+        return "`sudo dnf install llvm-libs`"
+    return f"`sudo apt-get install libllvm{PREFERRED_MAJOR}`"
