@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_origin
 
 from harnack.backend.elementary import fmax
 from harnack.enclosures.bounded_laplacian import BoundedLaplacianEnclosure
@@ -262,7 +262,9 @@ def _kinds_of_name(name: str) -> tuple[type[Enclosure], ...]:
 
 def _is_proof(kind: Any) -> bool:
     """Return whether `kind` is a class of enclosures that can be instantiated."""
-    return isinstance(kind, type) and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
+    # Python 3.10 takes list[int] for a class.
+    is_class = isinstance(kind, type) and get_origin(kind) is None
+    return is_class and issubclass(kind, Enclosure) and not inspect.isabstract(kind)
 
 
 def longest_free_length(enclosures: tuple[Enclosure, ...], gaps: LevelGaps) -> Real:

@@ -17,7 +17,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast, get_origin
 
 import drjit as dr
 import numpy as np
@@ -700,7 +700,8 @@ def suggest_field(value: Any) -> str:
     parts: list[Any] = [*value] if type(value) in (list, tuple) else []
     if any(isinstance(part, Field) for part in parts):
         return f"{object_of_kind} of fields: give one at a time, or to harnack.render one flat list"
-    if inspect.isclass(value) and issubclass(value, Field):
+    # Python 3.10 takes list[int] for a class.
+    if inspect.isclass(value) and get_origin(value) is None and issubclass(value, Field):
         return f"the class {name} itself: make one of it, {name}(...)"
     if hasattr(value, "vertices") and hasattr(value, "faces"):
         return f"{object_of_kind}: of a mesh, take harnack.WindingNumber(mesh.vertices, mesh.faces)"

@@ -496,14 +496,17 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
 
     parallel_over_slices(weigh_edges, n)
     # The matrix of the graph in compressed rows: k entries for each point.
-    row_starts = np.arange(0, n * k + 1, k, dtype=np.int64)
-    graph = sparse.csr_array((weight.ravel(), nearest.ravel(), row_starts), shape=(n, n))
+    # Before SciPy 1.16 spanning trees need indices of 32 bits.
+    index_type = np.int32 if n * k + 1 < 2**31 else np.int64
+    row_starts = np.arange(0, n * k + 1, k, dtype=index_type)
+    column = nearest.ravel().astype(index_type)
+    graph = sparse.csr_array((weight.ravel(), column, row_starts), shape=(n, n))
     forest = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     _, component = sparse.csgraph.connected_components(forest, directed=False)
     # An additional node is joined to all roots, so that one search from it visits all points.
     _, roots = np.unique(component, return_index=True)
-    start = np.concatenate([forest.row, np.full(len(roots), n)])
-    end = np.concatenate([forest.col, roots])
+    start = np.concatenate([forest.row, np.full(len(roots), n)]).astype(index_type)
+    end = np.concatenate([forest.col, roots]).astype(index_type)
     joined_graph = sparse.csr_array((np.ones(len(start)), (start, end)), shape=(n + 1, n + 1))
     _, predecessors = sparse.csgraph.breadth_first_order(joined_graph, n, directed=False)
     parent = np.asarray(predecessors[:n], dtype=np.int64)

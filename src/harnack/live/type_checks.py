@@ -69,7 +69,7 @@ def _fits(value: Any, hint: Any) -> bool:
         is_list = isinstance(value, tuple)
         return is_list and all(_fits(part, arguments[0]) for part in cast("tuple[Any, ...]", value))
     # Annotations of other kinds are not checked.
-    return not isinstance(hint, type) or isinstance(value, hint)
+    return origin is not None or not isinstance(hint, type) or isinstance(value, hint)
 
 
 def _type_in_words(hint: Any) -> str:
