@@ -149,7 +149,7 @@ def members_of(kind: type) -> Iterator[tuple[str, Any]]:
         if name.startswith("_"):
             continue
         member: Any = getattr(value, "__func__", value)
-        if (isinstance(member, property) or inspect.isfunction(member)) and inspect.getdoc(member):
+        if (isinstance(member, property) or inspect.isfunction(member)) and documentation(member):
             yield name, getattr(kind, name)
 
 
@@ -185,9 +185,16 @@ class _Shown:
         return "..." if text.startswith("<") or " at 0x" in text or len(text) > 60 else text
 
 
+def documentation(thing: Any) -> str:
+    """The docstring of a thing, or of what it overrides."""
+    text = inspect.getdoc(thing) or ""
+    # From Python 3.13 on None has a docstring, which a property that overrides it would inherit.
+    return "" if text == inspect.getdoc(None) else text
+
+
 def described(thing: Any) -> Iterator[str]:
     """The first paragraph of a docstring, indented."""
-    text = inspect.getdoc(thing) or ""
+    text = documentation(thing)
     paragraph = " ".join(text.partition("\n\n")[0].split())
     yield from textwrap.wrap(
         paragraph, _WIDTH, initial_indent="    ", subsequent_indent="    ", break_long_words=False

@@ -208,7 +208,7 @@ def test_a_file_is_found_beside_the_scene(tmp_path: Path) -> None:
 # Texts that are no scenes, and fields, surfaces and other parts of scenes that are none.
 WRONG = {
     "": "no JSON",
-    "[" * 100_000: "no JSON",
+    "[" * 100_000: "within each other",
     '{"harnack": NaN}': "NaN is no number",
     "[]": "must be an object",
     "{}": 'must say "harnack": 1',
@@ -239,9 +239,9 @@ WRONG_FIELDS = {
     """{"formula": "__import__('os')"}""": "no formula",
     '{"formula": 3}': "a formula is a text",
     '{"formula": "x=1", "parameters": {"a": 1}}': "no parameter 'a'",
-    '{"OffsetSolid": {"distance": 0.1, "field": ' * 450
+    '{"OffsetSolid": {"distance": 0.1, "field": ' * 2000
     + '{"Sphere": {}}'
-    + "}}" * 450: "each other",
+    + "}}" * 2000: "each other",
     '{"Sphere": {}}, "level": ' + "[" * 900 + "]" * 900: "within each other",
     '{"Complement": {"field": null}}': "Complement",
     '{"DeformedSolid": {"inner": {"Sphere": {}}, '

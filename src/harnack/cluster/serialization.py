@@ -561,6 +561,9 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
 # Attributes whose values are names, and attributes that contain dictionaries of names.
 _NAME_ATTRIBUTES = ("__name__", "__qualname__", "__module__", "__annotations__")
 _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
+# What Python notes in a class from version 3.13 on: its line in the file, which comments move, and
+# the names that its methods assign to, in an order that differs from process to process.
+_NOTED_BY_THE_COMPILER = ("__firstlineno__", "__static_attributes__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
@@ -570,7 +573,11 @@ def _with_encoded_keys(state: Any) -> Any:
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
         return state
-    attributes = dict(cast("dict[Any, Any]", state))
+    attributes = {
+        key: value
+        for key, value in cast("dict[Any, Any]", state).items()
+        if key not in _NOTED_BY_THE_COMPILER
+    }
     # Some values are names, too, and some are dictionaries of names.
     attributes |= {key: _encoded(attributes[key]) for key in _NAME_ATTRIBUTES if key in attributes}
     attributes |= {

@@ -510,13 +510,17 @@ def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFi
         SceneFileError: the text is no scene; the message names the part that is wrong.
     """
     try:
-        data = json.loads(text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys)
-    except (ValueError, RecursionError) as wrong:
-        raise SceneFileError(f"it is no JSON: {wrong}") from None
-    try:
-        return _scene_of(data, find)
+        return _scene_of(_parsed_json(text), find)
     except RecursionError:
         raise SceneFileError("more things are within each other than can be read") from None
+
+
+def _parsed_json(text: str) -> Any:
+    """Return the data of a JSON text. Raises a SceneFileError if it is no JSON."""
+    try:
+        return json.loads(text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys)
+    except ValueError as wrong:
+        raise SceneFileError(f"it is no JSON: {wrong}") from None
 
 
 def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
