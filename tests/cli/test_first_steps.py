@@ -227,14 +227,19 @@ def test_a_bar_of_the_demo_never_goes_back(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
     timing = DemoTiming([picture.seconds for picture in DEMO_PICTURES])
     seen: list[float] = []
-    monkeypatch.setattr(
-        "harnack.cli.demo.Bar.update", lambda self, task, completed: seen.append(completed)
-    )
+    update = demo.Bar.update
+
+    def record(bar: demo.Bar, *arguments: Any, **settings: Any) -> None:
+        update(bar, *arguments, **settings)
+        seen.append(bar.tasks[0].completed)
+
+    monkeypatch.setattr(demo.Bar, "update", record)
     with demo._show_progress(timing, 3, quiet=False) as show:
         assert callable(show)
-        show(Progress("building"))
-        show(Progress("", 0.0))
-    assert seen == [timing.done(3, 0.0)]
+        for told in (Progress("building"), Progress("", 0.5), Progress("", 0.1), Progress("", 0.8)):
+            show(told)
+    expected = [timing.done(3, part) for part in (0.0, 0.5, 0.5, 0.8)]
+    assert seen == pytest.approx(expected)
 
 
 def test_the_demo_without_llvm_says_what_to_do_and_does_nothing(

@@ -135,7 +135,8 @@ def _show_progress(
                _TimeColumn(timing))  # fmt: skip
     with Bar(*columns, console=console, transient=True) as bar:
         name = f"picture {index + 1} of {len(DEMO_PICTURES)}"
-        task = bar.add_task(name, total=1.0, completed=timing.done(index, 0.0))
+        task = bar.add_task(name, total=1.0)
+        bar.update(task, completed=timing.done(index, 0.0))
 
         def show(told: Progress) -> None:
             """Move the bar by what the picture tells of itself, but never back: parts of a picture
