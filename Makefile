@@ -9,12 +9,13 @@ FRAMEWORKS := torch==2.13.0 "jax==0.10.2; python_version >= '3.11'" "jaxlib==0.1
 TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
+.PHONY: help setup demo demo-all parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
 .PHONY: bench figures clean
 
 help:
 	@echo "make setup      install everything into .venv"
-	@echo "make demo       render the gallery's demo pictures into out/"
+	@echo "make demo       render six pictures into out/, in about a minute"
+	@echo "make demo-all   render 26 pictures of the gallery into out/"
 	@echo "make parts      make parts to print into out/"
 	@echo "make test       run the quick tests"
 	@echo "make test-slow  run the slow tests"
@@ -36,6 +37,9 @@ $(STAMP): pyproject.toml scripts/bootstrap.py
 	@touch $@
 
 demo: $(STAMP)
+	$(BIN)/harnack demo -o out
+
+demo-all: $(STAMP)
 	$(BIN)/harnack gallery --demo -o out
 
 parts: $(STAMP)

@@ -3,6 +3,8 @@
 The levels of a curve's solid angle, from nearly 0 to nearly a whole turn, are surfaces that sweep
 space around the curve and never leave it. Whatever is a function of s, which goes from 0 to 1,
 moves. Only the first frame compiles anything.
+
+Needs Pillow: `pip install 'harnack[film]'`.
 """
 
 import sys

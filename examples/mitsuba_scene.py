@@ -8,9 +8,8 @@ the direction of the normal.
 import sys
 from pathlib import Path
 
+import harnack as hk  # isort: skip  # before Mitsuba, so that Dr.Jit loads an LLVM that works
 import mitsuba as mi
-
-import harnack as hk
 
 mi.set_variant("llvm_ad_rgb")
 

@@ -10,9 +10,8 @@ import math
 import sys
 from pathlib import Path
 
+import harnack as hk  # isort: skip  # before Dr.Jit, so that it loads an LLVM that works
 import drjit as dr
-
-import harnack as hk
 
 
 class Wires(hk.Field):

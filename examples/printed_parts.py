@@ -2,6 +2,8 @@
 
 Each is one expression, in millimeters. It is drawn as it is, without triangles, and meshed, closed,
 into an STL file for a slicer.
+
+Needs matplotlib for the text: `pip install 'harnack[outlines]'`.
 """
 
 import math

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from types import FrameType
 
 
@@ -23,7 +24,11 @@ signal.signal(signal.SIGINT, _stop)
 
 
 def main() -> int:
-    """Run a command; the exit code, as `harnack.cli.main` has it."""
-    from harnack.cli import main as run  # not above: it takes a second
-
+    """Run a command; the exit code, as `harnack.cli.main` has it, and 1 if what harnack stands on
+    cannot be imported."""
+    try:
+        from harnack.cli import main as run  # not above: it takes a second
+    except ImportError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     return run()

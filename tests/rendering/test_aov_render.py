@@ -477,10 +477,3 @@ def test_a_camera_has_a_position_or_angles() -> None:
             hk.Camera(position=(1, 2, 3), **{name: 10.0})
     assert hk.Camera().azimuth_elevation == (-50.0, 28.0)
     assert hk.Camera(elevation=10.0).azimuth_elevation == (-50.0, 10.0)
-
-
-def test_the_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([])
-    assert ended.value.code == 2
-    assert "draw one picture" in capsys.readouterr().err

@@ -10,14 +10,16 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, cast
 
 from harnack._version import __version__
 from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
+from harnack.cli.welcome import print_welcome
 from harnack.field_from_file import UP_AXES
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+from harnack.gallery import SCENES
 from harnack.live.live_scene import LIVE_MODES
 from harnack.live.sliders import Slider
 from harnack.name_suggestions import did_you_mean
@@ -85,14 +87,19 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the arguments of a command, by default those of this process. The result has an
     attribute for each option, and the name of the command in `command`.
 
-    Ends the process with exit code 2 for wrong usage, and after printing a help text if there are
-    no arguments.
+    Ends the process with exit code 2 for wrong usage, and with 0 after printing a welcome if there
+    are no arguments.
     """
+    given = [*(sys.argv[1:] if arguments is None else arguments)]
     whole, commands = parsers()
-    if not (sys.argv[1:] if arguments is None else arguments):
-        whole.print_help(sys.stderr)
-        whole.exit(2)
-    namespace, unknown = whole.parse_known_args(arguments)
+    if not given:
+        print_welcome()
+        whole.exit(0)
+    if given[0] == "help":  # `harnack help render` is `harnack render --help`
+        given = [*given[1:2], "--help"]
+    if not given[0].startswith("-") and given[0] not in commands:
+        whole.error(_no_command(given[0], commands))
+    namespace, unknown = whole.parse_known_args(given)
     if unknown:
         command: _Parser = commands[namespace.command]
         known = command.options()
@@ -101,6 +108,20 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         is_option = unknown[0].startswith("-")
         command.error(_no_option(unknown[0], known) if is_option else _no_use(unknown[0], command))
     return namespace
+
+
+def _no_command(written: str, commands: Iterable[str]) -> str:
+    """Return the message about a first argument that is no command. If it is what can be drawn, the
+    message says how.
+
+    written: the argument.
+    commands: the names of all commands.
+    """
+    problem = f"there is no command {text.quoted(written)}"
+    if written in SCENES or "=" in written or written.lower().endswith(GEOMETRY_SUFFIXES):
+        return f"{problem}; to draw it, write `harnack render` before it"
+    hint = did_you_mean(written, commands)
+    return f"{problem}{hint}" if hint else f"{problem}; there are {', '.join(commands)}"
 
 
 def _no_option(written: str, known: Sequence[str]) -> str:
@@ -135,6 +156,8 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     )
     whole.add_argument("--version", action="version", version=f"harnack {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    _add_demo(commands)
+    _add_examples(commands)
     _add_render(commands)
     _add_animate(commands)
     _add_page(commands)
@@ -145,7 +168,7 @@ def parsers() -> tuple[_Parser, dict[str, _Parser]]:
     gallery = commands.add_parser("gallery", help="draw or list the named scenes")
     gallery.add_argument("names", nargs="*", metavar="NAME", help="scenes to draw (all)")
     gallery.add_argument("--list", action="store_true", help="list them and draw nothing")
-    gallery.add_argument("--demo", action="store_true", help="only those of `make demo`, small")
+    gallery.add_argument("--demo", action="store_true", help="only those of `make demo-all`, small")
     gallery.add_argument("-o", "--output", metavar="FOLDER", default="out", help="folder (out)")
     _add_options(gallery, "render", only=("size", "spp", "seed"))
     _add_quiet(gallery)
@@ -275,6 +298,35 @@ def _add_drawing(parser: Any, verb: str, output: str | None) -> None:
     _add_options(parser, verb)
     _add_camera(parser)
     _add_file_options(parser)
+
+
+def _add_demo(commands: Any) -> None:
+    """Add the command `demo`, which draws six pictures, to the parsers of commands."""
+    parser = commands.add_parser(
+        "demo", help="draw six pictures, in about a minute",
+        description="Draw six pictures that show what harnack is for: surfaces that span a knot "
+        "and a link, glass, a carved solid, a mesh with holes, and points. Five are shaded, which "
+        "takes seconds; the glass follows light paths.",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--output", metavar="FOLDER", default="harnack-demo", help="folder (harnack-demo)"
+    )
+    _add_options(parser, "render", only=("size", "spp", "seed"))
+    _add_quiet(parser)
+
+
+def _add_examples(commands: Any) -> None:
+    """Add the command `examples`, which copies example scripts, to the parsers of commands."""
+    parser = commands.add_parser(
+        "examples", help="copy Python scripts to start from, or list them",
+        description="Copy the example scripts into a folder, and list them. Files that are there "
+        "already and differ are not overwritten.",
+    )  # fmt: skip
+    parser.add_argument(
+        "folder", nargs="?", metavar="FOLDER", default="harnack-examples",
+        help="folder to copy to (harnack-examples)",
+    )  # fmt: skip
+    parser.add_argument("--list", action="store_true", help="list them and copy nothing")
 
 
 def _add_source(parser: Any, output: str | None) -> None:

@@ -6,6 +6,7 @@ what is drawn or meshed: a scene of the gallery, a file or a formula.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +16,8 @@ import numpy as np
 from rich.console import Console
 
 from harnack.backend import doctor
+from harnack.cli.demo import check_demo_backend, draw_demo
+from harnack.cli.example_scripts import copy_scripts, example_scripts
 from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import python_to_cli_terms
 from harnack.cli.sources import (
@@ -39,7 +42,8 @@ from harnack.rendering.animation import check_film_path
 from harnack.rendering.images import check_picture_path
 from harnack.rendering.option_table import SHORTHAND
 
-_DEMO_SIZE = (480, 360)
+# Of the pictures of `gallery --demo`, in pixels.
+_SMALL_SIZE = (480, 360)
 
 
 def _render(arguments: Any) -> int:
@@ -250,7 +254,7 @@ def _gallery(arguments: Any) -> int:
                 f"{did_you_mean(name, SCENES)}"
             )
     scenes = [SCENES[name] for name in arguments.names] or list(SCENES.values())
-    if arguments.demo:  # only scenes of the demo have a number of samples for it
+    if arguments.demo:  # only scenes that are drawn with --demo have a number of samples for it
         scenes = [scene for scene in scenes if scene.demo_spp > 0]
     folder = _create_folder(arguments.output)
     for index, scene in enumerate(scenes, start=1):
@@ -258,8 +262,8 @@ def _gallery(arguments: Any) -> int:
             f"{index}/{len(scenes)} [bold]{scene.name}[/]: {scene.title}", highlight=False
         )
         target = folder / f"{scene.name}.png"
-        # Pictures of the demo are small; options that were given count nevertheless.
-        small = {"size": _DEMO_SIZE, "spp": scene.demo_spp} if arguments.demo else {}
+        # These pictures are small; options that were given count nevertheless.
+        small = {"size": _SMALL_SIZE, "spp": scene.demo_spp} if arguments.demo else {}
         scene.render(
             target, **{**small, **options_set("render", arguments), "progress": not arguments.quiet}
         )
@@ -268,11 +272,37 @@ def _gallery(arguments: Any) -> int:
     return 0
 
 
-def _create_folder(name: str) -> Path:
+def _demo(arguments: Any) -> int:
+    """Run the command `demo`: draw six pictures into a folder."""
+    check_demo_backend()
+    draw_demo(_create_folder(arguments.output), arguments)
+    return 0
+
+
+def _examples(arguments: Any) -> int:
+    """Run the command `examples`: list the example scripts, and copy them into a folder."""
+    scripts = example_scripts()
+    folder = arguments.folder
+    if not arguments.list:
+        copy_scripts(scripts, _create_folder(folder, "the folder's name"))
+    width = max(len(script.name) for script in scripts) + 2
+    for script in scripts:
+        print_line(f"{script.name:<{width}}{script.title}{script.requirement}")
+    if arguments.list:
+        print_line(f"`harnack examples` copies them into the folder {folder}")
+        return 0
+    print_line(f"{len(scripts)} scripts are in {Path(folder).resolve()}; run one, such as by")
+    script = Path(folder) / "spanning_surface.py"
+    print_line(f"    {shlex.join(['python', str(script), 'out'])}")
+    print_line("which writes into the folder out")
+    return 0
+
+
+def _create_folder(name: str, argument: str = "-o") -> Path:
     """Create the folder with this name if it does not exist, and return its path. Raises a
-    ValueError if that is impossible."""
+    ValueError if that is impossible. argument: what the name was given as, for the message."""
     if not name:
-        raise ValueError("-o is empty: name the folder to write to, such as out")
+        raise ValueError(f"{argument} is empty: name the folder to write to, such as out")
     folder = Path(name)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -301,6 +331,8 @@ COMMANDS: Mapping[str, Callable[[Any], int]] = MappingProxyType(
         "repair": _repair,
         "check": _check,
         "gallery": _gallery,
+        "demo": _demo,
+        "examples": _examples,
         "doctor": _doctor,
     }
 )

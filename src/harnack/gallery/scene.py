@@ -23,8 +23,8 @@ class Scene:
     surfaces: a function that returns the surfaces.
     materials: the name of each surface's material, or a single name for all surfaces.
     camera, show, options: options of `render` by these names.
-    demo_spp: samples per pixel in `make demo`, few enough for the demo to take a few minutes; 0
-        leaves the scene out of the demo.
+    demo_spp: samples per pixel in `harnack gallery --demo`, few enough for all these pictures to
+        take some minutes; 0 leaves the scene out of them.
     """
 
     name: str
