@@ -10,7 +10,7 @@ TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
-.PHONY: bench figures clean
+.PHONY: bench figures dist clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -27,6 +27,7 @@ help:
 	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
+	@echo "make dist       build the wheel and the source archive into dist/, and check both; FAST=1 without installing them"
 	@echo "make clean      remove .venv, out/ and caches"
 
 setup: $(STAMP)
@@ -96,6 +97,11 @@ bench: $(STAMP)
 figures: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python -m figures
+
+# FAST=1 leaves out the installations into fresh environments, which need the network and minutes.
+dist: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dist]'
+	$(BIN)/python scripts/dist.py $(if $(FAST),--fast)
 
 clean:
 	rm -rf .venv out site jupyter_execute build dist .hypothesis .pytest_cache .ruff_cache
