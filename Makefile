@@ -22,7 +22,7 @@ help:
 	@echo "make test-browser  install Chromium if need be and test pages and views in it"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
-	@echo "make site       build the documentation into site/; a warning is an error"
+	@echo "make site       build the documentation into site/; a warning is an error; TAG=v0.1.0 that of a tag into site/v0.1.0"
 	@echo "make reference  write signatures and the table of options into the docs"
 	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
@@ -79,9 +79,14 @@ images: $(STAMP)
 	$(BIN)/python scripts/bootstrap.py browser
 	$(BIN)/python scripts/live_image.py docs/images
 
-# Notebooks are run while the site is built.
+# Notebooks are run while the site is built. With TAG, the sources are those of that tag.
 site: $(STAMP)
+ifdef TAG
+	$(BIN)/python scripts/site/versions.py $(TAG)
+else
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c scripts/site -d out/site . site
+	$(BIN)/python scripts/site/versions.py
+endif
 
 reference: $(STAMP)
 	$(BIN)/python scripts/reference.py
