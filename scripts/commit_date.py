@@ -49,7 +49,9 @@ def git(root: Path, *arguments: str) -> str:
     Raises:
         RuntimeError: the command failed. The message has its words.
     """
-    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["git", *arguments], cwd=root, capture_output=True, text=True, check=False
+    )
     if done.returncode:
         raise RuntimeError(f"git {' '.join(arguments)} failed in {root}: {done.stderr.strip()}")
     return done.stdout

@@ -28,8 +28,8 @@ from pathlib import Path, PurePosixPath
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import fresh_install  # noqa: E402
-from commit_date import git, is_repository, source_date  # noqa: E402
+import fresh_install
+from commit_date import git, is_repository, source_date
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_WHEEL_BYTES = 3_000_000
@@ -88,7 +88,9 @@ def make_packages(root: Path, folder: Path, python: str | None) -> None:
     with tempfile.TemporaryDirectory(prefix="harnack-dist-") as text:
         work = Path(text)
         packages = build_reproducibly(root, work)
-        run([sys.executable, "-m", "twine", "check", "--strict", *map(str, vars(packages).values())])
+        run(
+            [sys.executable, "-m", "twine", "check", "--strict", *map(str, vars(packages).values())]
+        )
         report("Twine has no complaints")
         check_wheel(packages.wheel, sources_of(work / "first" / "src"))
         check_archive(packages.archive)

@@ -27,6 +27,8 @@ sys.path.insert(0, str(ROOT / "scripts"))
 
 from commit_date import git, is_repository  # noqa: E402
 
+# What the template `templates/page.html` writes at the end of every page.
+EDITION = re.compile(r'<p class="edition">(harnack [^<]*?)\.? <')
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -34,7 +36,9 @@ _PAGE = """<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">
 <title>Versions of harnack</title>
-<style>body {{ font-family: sans-serif; margin: 3rem auto; max-width: 40rem; padding: 0 1rem }}</style>
+<style>
+body {{ font-family: sans-serif; margin: 3rem auto; max-width: 40rem; padding: 0 1rem }}
+</style>
 </head>
 <body>
 <h1>Versions of harnack</h1>
@@ -144,7 +148,7 @@ def entry(site: Path, page: str, what: str) -> str:
         ValueError: the page does not say its version.
     """
     text = (site / page).read_text(encoding="utf-8")
-    edition = re.search(r'<p class="edition">(harnack [^<]*?)\.? <', text)
+    edition = EDITION.search(text)
     if edition is None:
         raise ValueError(f"{site / page} does not say its version at its end; build it again")
     return f'<li><a href="{html.escape(page)}">{edition[1]}</a>: {what}</li>'
