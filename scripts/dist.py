@@ -85,6 +85,8 @@ def make_packages(root: Path, folder: Path, python: str | None) -> None:
         CheckError: something is wrong. `folder` is as it was.
         fresh_install.TrialError: a package does not work in a fresh environment.
     """
+    if has_changes(root):
+        report("some files differ from the last commit: not packages to publish")
     with tempfile.TemporaryDirectory(prefix="harnack-dist-") as text:
         work = Path(text)
         packages = build_reproducibly(root, work)
@@ -154,8 +156,13 @@ def copy_sources(root: Path, target: Path) -> None:
         if name and source.is_file():  # and was not deleted
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(source, target / name)
-    if git(root, "status", "--porcelain", "--untracked-files=no"):
-        report("some files differ from the last commit: not packages to publish")
+
+
+def has_changes(root: Path) -> bool:
+    """Return whether tracked files in `root` differ from the last commit. Without Git: False."""
+    if not is_repository(root):
+        return False
+    return git(root, "status", "--porcelain", "--untracked-files=no") != ""
 
 
 def build(source: Path, folder: Path, epoch: str) -> Packages:
