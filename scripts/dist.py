@@ -72,7 +72,7 @@ def main() -> None:
     arguments = parser.parse_args()
     try:
         make_packages(ROOT, ROOT / "dist", None if arguments.fast else arguments.python)
-    except (CheckError, fresh_install.TrialError) as error:
+    except (CheckError, fresh_install.TrialError, RuntimeError, ValueError) as error:
         sys.exit(f"dist: {error}")
 
 
@@ -83,6 +83,8 @@ def make_packages(root: Path, folder: Path, python: str | None) -> None:
 
     Raises:
         CheckError: something is wrong. `folder` is as it was.
+        RuntimeError: Git failed.
+        ValueError: the sources have no date.
         fresh_install.TrialError: a package does not work in a fresh environment.
     """
     if has_changes(root):
