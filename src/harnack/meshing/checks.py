@@ -13,7 +13,7 @@ check.
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Never
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -95,7 +95,7 @@ def check_manifold(faces: IntArray, vertices: FloatArray | None = None) -> None:
             given.
     """
 
-    def fail(message: str, vertex_ids: IntArray) -> Never:
+    def fail(message: str, vertex_ids: IntArray) -> NoReturn:
         """Raise the error of a failed check; `vertex_ids` are the indices of the vertices at which
         it failed."""
         if vertices is None:
