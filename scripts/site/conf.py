@@ -17,15 +17,17 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
-sys.path.insert(0, str(HERE))
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 # A kernel that does not warn of what every notebook on one machine does.
 os.environ["JUPYTER_PATH"] = str(HERE / "jupyter")
 logging.getLogger("traitlets").setLevel(logging.WARNING)
 
+from commit_date import source_date  # noqa: E402
+
 import harnack  # noqa: E402
 
 project = "harnack"
-author = "The harnack authors"
+author = copyright = "The harnack authors"
 version = release = harnack.__version__
 
 extensions = [
@@ -67,6 +69,12 @@ html_title = f"harnack {version}"
 html_copy_source = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+templates_path = ["templates"]
+# For the end of every page. `versions.py` puts the list of versions elsewhere for tags.
+html_context = {
+    "source_date": f"{source_date(ROOT):%Y-%m-%d}",
+    "version_list": "versions.html",
+}
 copybutton_exclude = ".linenos, .gp, .go"
 
 CONTENTS = {

@@ -343,7 +343,7 @@ def _columns(
             raise places[k].error(f"the length of a list is no integer, but {lengths[k]}")
         # A list with a negative or too large length gets a length that ends after the end of the
         # file.
-        sizes = np.where(lengths < 0, values.size + 1, lengths).astype(np.int64)
+        sizes = np.where(lengths < 0, values.size + 1, lengths.astype(np.int64))
         sizes = np.minimum(sizes, values.size + 1)
         offset += values.width(ply_property.length_code)
         columns[ply_property.name] = PropertyColumn(ply_property.code, positions, offset, sizes)
