@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,6 +145,10 @@ def check_saved_hits(page: Variables) -> None:
 
 
 def check_dlpack(page: Variables) -> None:
+    from drjit.llvm.ad import Array3f
+
+    import harnack as hk
+
     np.testing.assert_allclose(page["t"], [1.75, 1.75, np.inf], atol=1e-3)
     assert page["hit"].tolist() == [True, True, False]
     rows = [[0.7, 0, 0.25], [0, 0.7, 0.25]]
@@ -151,6 +156,11 @@ def check_dlpack(page: Variables) -> None:
     for name in ("t", "position"):
         again = np.from_dlpack(getattr(page["hits"], name))
         assert np.shares_memory(page[name], again)
+    rays = Array3f(page["origins"].T), Array3f(0, 0, -1)
+    position = hk.trace(hk.Torus(0.7, 0.25), *rays).position
+    columns = np.from_dlpack(position)
+    np.testing.assert_array_equal(columns.T, page["position"])
+    assert not np.shares_memory(columns, np.from_dlpack(position))
 
 
 # trimesh
@@ -182,8 +192,10 @@ def check_pyvista_plot(page: Variables) -> None:
     mesh = page["mesh"]
     check_grooved_ball(page["shown"].points, page["shown"].regular_faces)
     check_curvature(page["shown"].points, page["shown"]["mean curvature"])
-    with pytest.warns(UserWarning, match="harnack"):
+    with warnings.catch_warnings(record=True) as caught:
         wrapped = pv.wrap(mesh)
+    # Of PyVista 0.49, which reads metadata; older versions do not.
+    assert all("metadata key 'harnack'" in str(warning.message) for warning in caught)
     for shown in (page["shown"], wrapped):
         np.testing.assert_array_equal(shown.points, mesh.vertices)
         np.testing.assert_array_equal(shown.regular_faces, mesh.faces)
@@ -343,6 +355,43 @@ def test_blender_renders_the_mesh(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         check_blender_picture(variables)
+
+
+# Code that defines a function `draw`, which draws something into a file.
+DRAWING = {
+    "polyscope": """
+import polyscope as ps
+ps.set_allow_headless_backends(True)
+ps.init()
+ps.register_surface_mesh("triangle", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
+def draw(name):
+    ps.screenshot(name)
+""",
+    "pyvista": """
+import pyvista as pv
+def draw(name):
+    plotter = pv.Plotter(off_screen=True)
+    plotter.add_mesh(pv.Sphere())
+    plotter.screenshot(name)
+""",
+}
+
+
+@pytest.mark.parametrize("tool", DRAWING)
+def test_tools_may_draw_before_harnack_is_imported(tool: str, tmp_path: Path) -> None:
+    """They load the LLVM of Mesa's driver, which is another one than Dr.Jit's."""
+    code = f"""
+{DRAWING[tool]}
+draw("before.png")
+import harnack as hk
+hits = hk.trace(hk.Sphere(0.5) - hk.Torus(0.4, 0.1), [[0, 0, 2.0]], [[0, 0, -1.0]])
+assert abs(hits.t[0] - 1.5) < 1e-3
+draw("after.png")
+"""
+    run_in_folder(tmp_path, Path(sys.executable), "-c", code)
+    pixels = [picture(str(tmp_path / f"{name}.png")) for name in ("before", "after")]
+    assert pixels[0].std() > 0.01
+    np.testing.assert_allclose(*pixels, atol=0.02)
 
 
 def test_every_block_is_run() -> None:
