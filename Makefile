@@ -5,12 +5,15 @@ STAMP := .venv/.setup-stamp
 # JAX needs Python 3.11; its tests are skipped before.
 FRAMEWORKS := torch==2.13.0 "jax==0.10.2; python_version >= '3.11'" "jaxlib==0.10.2; python_version >= '3.11'"
 
+# Blender as a module has wheels for one version of Python each, and wants a NumPy of its own.
+BLENDER := "bpy==5.0.1; python_version == '3.11'" "bpy==5.3.0; python_version == '3.13'"
+
 # What checks the JavaScript of pages and views, which itself depends on nothing.
 TYPES := 'typescript@5.9.3', '@webgpu/types@0.1.66'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo demo-all parts test test-slow test-frameworks test-browser lint format site reference site-pictures images
-.PHONY: bench figures dist clean
+.PHONY: help setup demo demo-all parts test test-slow test-frameworks test-interop test-browser lint format site
+.PHONY: reference site-pictures images bench figures dist clean
 
 help:
 	@echo "make setup      install everything into .venv"
@@ -20,6 +23,7 @@ help:
 	@echo "make test       run the quick tests"
 	@echo "make test-slow  run the slow tests"
 	@echo "make test-frameworks  install PyTorch and JAX into .venv and test derivatives to and from them"
+	@echo "make test-interop  install PyVista, Open3D, Blender and others, and test the pages about them"
 	@echo "make test-browser  install Chromium if need be and test pages and views in it"
 	@echo "make lint       check style and types"
 	@echo "make format     apply the style"
@@ -60,6 +64,15 @@ test-frameworks: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(FRAMEWORKS)
 	$(BIN)/python -c "import torch"
 	$(BIN)/python -m pytest -q -n auto -m "slow or not slow" tests/backend/test_frameworks.py
+
+# `pip check`: whatever was installed before, all of it goes together.
+test-interop: $(STAMP)
+	$(BIN)/python scripts/bootstrap.py tools
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[interop]'
+	test -e .venv/blender || $(BIN)/python -m venv --without-pip .venv/blender
+	$(BIN)/python -m pip --python .venv/blender install --quiet --disable-pip-version-check $(BLENDER)
+	$(BIN)/python -m pip check
+	$(BIN)/python -m pytest -q -n auto -m interop tests/project/test_interoperability.py
 
 # Chromium draws pages and views, with a GPU that is computed on the CPU; pictures go to out/browser.
 test-browser: $(STAMP)

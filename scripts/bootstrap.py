@@ -118,6 +118,38 @@ def provide_browser() -> None:
     run([str(VENV_PYTHON), "-m", "playwright", "install", "chromium"])
 
 
+# What the tools of docs/interoperability load of the system, and the packages that have it: Open3D
+# libusb, VTK and Polyscope EGL with Mesa's driver, Blender the others.
+TOOL_LIBRARIES = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libEGL_mesa.so.0": "libegl-mesa0",
+    "libSM.so.6": "libsm6",
+    "libXt.so.6": "libxt6",
+    "libXi.so.6": "libxi6",
+    "libXrender.so.1": "libxrender1",
+    "libXfixes.so.3": "libxfixes3",
+    "libxkbcommon.so.0": "libxkbcommon0",
+}
+
+
+def provide_tool_libraries() -> None:
+    """Install the libraries of the system that tests of other tools need; where that cannot be
+    done, end with the names of those that are missing."""
+    missing = [
+        package
+        for library, package in TOOL_LIBRARIES.items()
+        if not works(VENV_PYTHON, f"import ctypes; ctypes.CDLL({library!r})")
+    ]
+    if not missing:
+        return
+    apt = Apt() if shutil.which("apt-get") and shutil.which("dpkg") else None
+    if apt is None or not apt.is_root:
+        sys.exit(f"setup: install these first, or what they are called here: {' '.join(missing)}")
+    apt.install(*missing)
+
+
 def is_ubuntu() -> bool:
     release = Path("/etc/os-release")
     return release.exists() and "\nID=ubuntu" in "\n" + release.read_text()
@@ -171,4 +203,5 @@ class Apt:
 
 
 if __name__ == "__main__":
-    provide_browser() if sys.argv[1:] == ["browser"] else main()
+    tasks = {(): main, ("browser",): provide_browser, ("tools",): provide_tool_libraries}
+    tasks[tuple(sys.argv[1:])]()

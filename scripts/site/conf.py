@@ -93,6 +93,13 @@ CONTENTS = {
         "docs/cluster",
         "docs/cookbook",
     ],
+    "With other tools": [
+        f"docs/interoperability/{page}"
+        for page in (
+            *("index", "arrays", "trimesh", "pyvista", "polyscope"),
+            *("open3d", "meshio", "viser", "blender"),
+        )
+    ],
     "More surfaces": ["docs/circles", "docs/polygon-meshes", "docs/plane", "docs/morph"],
     "Reference": [
         "docs/options",

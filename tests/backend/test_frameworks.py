@@ -333,6 +333,30 @@ def test_the_page_has_code() -> None:
     assert len(PAGE) == 5
 
 
+@pytest.mark.slow
+def test_dlpack_hands_out_hits_without_a_copy() -> None:
+    """The page `docs/interoperability/arrays.md`; `make test-interop` runs its other code."""
+    *_, block = blocks_of(ROOT / "docs" / "interoperability" / "arrays.md")
+    page: dict[str, Any] = {}
+    exec(block, page)
+    positions = page["hits"].position
+    expected = np.array([[0.7, 0, 0.25], [0, 0.7, 0.25], [np.nan] * 3])
+    for shared in (page["with_torch"].numpy(), np.asarray(page["with_jax"])):
+        np.testing.assert_allclose(shared, expected, atol=1e-3)
+        assert np.shares_memory(shared, np.from_dlpack(positions))
+
+
+@pytest.mark.slow
+def test_tensors_on_the_cpu_are_rays_like_numpy_arrays() -> None:
+    expected = hk.trace(hk.SolidAngle(LOOP), EYE[None].astype("f4"), AWAY.astype("f4"))
+    assert expected.is_hit.any()
+    for module in (torch, jax.numpy):
+        rays = [module.asarray(a.astype("f4")) for a in (EYE[None], AWAY)]
+        hits = hk.trace(hk.SolidAngle(LOOP), *rays)
+        assert isinstance(hits.t, np.ndarray)
+        assert hits.t.tobytes() == expected.t.tobytes()
+
+
 @pytest.mark.parametrize("framework", ["torch", "jax"])
 @pytest.mark.parametrize(
     "made",

@@ -496,8 +496,8 @@ def test_loose_parts_that_are_kept_are_listed(keep: Any) -> None:
 
 
 def test_settings_that_are_refused() -> None:
-    with pytest.raises(TypeError, match="vertices and faces"):
-        hk.repair(np.zeros((3, 3)))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"a pair \(vertices, faces\)"):
+        hk.repair(np.zeros((3, 3)))
     with pytest.raises(ValueError, match="tolerance"):
         hk.repair(ball(), tolerance=0)
     with pytest.raises(ValueError, match='keep is None, "all", "valid" or "none"'):

@@ -25,6 +25,7 @@ from harnack.backend.validation import (
 
 __all__ = [
     "MeshError",
+    "mesh_arrays",
     "solid_angles",
     "validate_mesh",
     "without_zero_area_faces",
@@ -41,6 +42,29 @@ ZERO_AREA_RATIO = 8.0 * float(np.finfo(np.float64).eps)
 
 class MeshError(ValueError):
     """A mesh cannot be used; the message says why and what to do."""
+
+
+def mesh_arrays(mesh: Any) -> tuple[Any, Any]:
+    """Return the vertices (n, 3) and the faces (m, 3) of a mesh as they are, not validated yet.
+
+    mesh: an object with the attributes `vertices` and `faces`, such as a trimesh.Trimesh; or a pair
+        (vertices, faces).
+
+    Raises:
+        TypeError: the argument is neither. The message says which pairs to give for meshes of
+            other libraries.
+    """
+    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        return mesh.vertices, mesh.faces
+    pair: Any = mesh
+    if isinstance(mesh, tuple | list) and len(pair) == 2:
+        return pair[0], pair[1]
+    raise TypeError(
+        "a mesh is a trimesh.Trimesh, a pair (vertices, faces) or, where files are read, the path "
+        f"of a file, not of type {type(pair).__name__}. Of other libraries give the pair: "
+        "(mesh.points, mesh.regular_faces) of PyVista, (mesh.vertices, mesh.triangles) of Open3D, "
+        '(mesh.points, mesh.cells_dict["triangle"]) of meshio'
+    )
 
 
 def validate_mesh(

@@ -21,6 +21,7 @@ from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.mesh_edges import Edges, half_edges, has_distinct_corners, longest_edges
+from harnack.geometry.meshes import mesh_arrays
 from harnack.geometry.welding import Welded
 from harnack.meshing.checks import nonmanifold_vertices
 from harnack.meshing.components import Shells
@@ -200,15 +201,7 @@ def _mesh_of(part: Any) -> tuple[FloatArray, IntArray, PrintProblem]:
             read.rounded,
         )
     else:
-        pair = (part.vertices, part.faces) if hasattr(part, "faces") else part
-        try:
-            vertices, raw_faces = pair
-        except (TypeError, ValueError):
-            raise TypeError(
-                "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not "
-                f"of type {type(part).__name__}"
-            ) from None
-        x, faces = validate_mesh(vertices, raw_faces, allow_zero_area=True)
+        x, faces = validate_mesh(*mesh_arrays(part), allow_zero_area=True)
         rounded_count = 0
     # Vertices that differ by rounding get the index of one of them.
     welded = Welded.of(x, faces)

@@ -35,7 +35,7 @@ from harnack.fields.solid_angles.winding_number import WindingNumber
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.boundary_edges import singular_edges, weld_vertices
-from harnack.geometry.meshes import without_zero_area_faces
+from harnack.geometry.meshes import mesh_arrays, without_zero_area_faces
 from harnack.geometry.orientability import is_nonorientable
 from harnack.meshing.bodies import mended_by_cuts, united_parts
 from harnack.meshing.checks import euler_characteristic, nonmanifold_vertices
@@ -86,7 +86,7 @@ Patches = Literal["smooth", "harmonic"]
 
 
 def repair(
-    mesh: trimesh.Trimesh,
+    mesh: Any,
     *,
     keep: Keep | None = None,
     filling: Patches = "smooth",
@@ -123,7 +123,8 @@ def repair(
     one that differs least is returned, with a warning. The comparison is a sample: what differs in
     less than a thousandth of the box may not be seen.
 
-    mesh: anything with `vertices` (n, 3) and `faces` (m, 3).
+    mesh: anything with `vertices` (n, 3) and `faces` (m, 3), such as a trimesh.Trimesh, or the
+        pair (vertices, faces).
     keep: which stages to try. "all" is only "filled", "valid" only "cleaned", "none" only
         "remeshed"; an error is raised if the stage fails. None tries all five, up to the first that
         succeeds.
@@ -183,6 +184,7 @@ def repair(
         signs, such as far and within; kept is 0.
 
     Raises:
+        TypeError: the argument is no mesh.
         MeshError: a ValueError. The mesh has no triangles, or numbers that are not finite; or it
             would be remeshed and is an open sheet: most of it has nothing inside. With keep="all"
             also: it has edges of more than two faces, faces that disagree in orientation, faces
@@ -196,9 +198,10 @@ def repair(
     accuracy = MeshTolerance.of(trace_options("repair", options, keywords, ("tolerance",)))
     with show_progress("repair", progress) as reporter:
         settings = _checked_settings(keep, filling, accuracy, cell_size, seed, reporter.tell)
-        _check_is_mesh(mesh)
-        _check_encloses(mesh)
-        intended = IntendedSolid.of(mesh, as_it_is=keep == "all")
+        vertices, faces = mesh_arrays(mesh)
+        input_mesh = TriangleMesh(np.asarray(vertices), np.asarray(faces))
+        _check_encloses(input_mesh)
+        intended = IntendedSolid.of(input_mesh, as_it_is=keep == "all")
         stages = {
             "all": _fill_only,
             "boolean_union": _unite_bodies,
@@ -338,27 +341,14 @@ def _count_kept(surface: TriangleMesh, whole: TriangleMesh, input_count: int) ->
     return sum(row.tobytes() in present for row in corners[1][:input_count])
 
 
-def _check_is_mesh(mesh: Any) -> None:
-    """Raise a TypeError unless the object has vertices and faces."""
-    if not hasattr(mesh, "vertices") or not hasattr(mesh, "faces"):
-        raise TypeError(
-            f"repair takes a mesh with vertices and faces, such as a trimesh.Trimesh, not "
-            f"{type(mesh).__name__}"
-        )
-
-
-def _check_encloses(mesh: Any) -> None:
+def _check_encloses(mesh: TriangleMesh) -> None:
     """Check that a mesh can enclose something.
-
-    mesh: any object with `vertices` (n, 3) and `faces` (m, 3).
 
     Raises:
         MeshError: all faces lie in a plane, or the mesh has one side only, like a Moebius strip; or
             `validate_mesh` rejects it.
     """
-    vertices, faces = validate_mesh(
-        np.asarray(mesh.vertices), np.asarray(mesh.faces), allow_zero_area=True
-    )
+    vertices, faces = validate_mesh(mesh.vertices, mesh.faces, allow_zero_area=True)
     x = vertices[np.unique(faces)]
     x = x - x.mean(axis=0)
     # Points lie in a plane if one singular value is nearly 0.

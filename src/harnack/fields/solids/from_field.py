@@ -9,6 +9,7 @@ above."""
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,7 @@ from harnack.fields.solids.solid import (
     formula_of,
     without_levels,
 )
+from harnack.geometry.meshes import mesh_arrays
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -64,6 +66,7 @@ def solid(
         hk.solid("part.stl") - hk.Cylinder(2.0, 50.0)
 
     Raises:
+        TypeError: the argument is neither a field nor a mesh.
         ValueError: none, or more than one, of the four level arguments for a field; numbers out of
             range; a field with jumps; an angle-valued field without `around`; a mesh that bounds no
             solid (`MeshError`).
@@ -77,6 +80,7 @@ def solid(
             )
         return solid_of_mesh(field)
     if len(bounds) != 1:
+        _check_is_no_mesh(field)
         raise ValueError("give exactly one of below=, above=, between=, around=")
     check_is_field(field)
     if field.traits.has_jumps:
@@ -108,6 +112,13 @@ def solid(
     if not lower < upper:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
     return BandSolid(field, 0.5 * (lower + upper), 0.5 * (upper - lower))
+
+
+def _check_is_no_mesh(argument: Any) -> None:
+    """Raise a TypeError that says how meshes are given, if the argument of `solid` may have been
+    meant as one: it is no field, and no name."""
+    if not isinstance(argument, Field | str | os.PathLike):
+        mesh_arrays(argument)
 
 
 def _levels(levels: Any, count: int) -> tuple[float, ...] | None:

@@ -41,6 +41,7 @@ from harnack.files.geometry_files import GEOMETRY_SUFFIXES, LoadedMesh, read_geo
 from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single
 from harnack.geometry import MeshError, validate_mesh, zero_area_faces
 from harnack.geometry.mesh_edges import area_normals
+from harnack.geometry.meshes import mesh_arrays
 from harnack.geometry.orientability import is_nonorientable
 from harnack.geometry.welding import Welded
 from harnack.tree import build_balanced_tree
@@ -96,16 +97,7 @@ def solid_of_mesh(source: Any) -> MeshSolid:
             raise MeshError(f"{source}: it holds no faces, so it bounds no solid")
         faces = np.concatenate([surface.faces, surface.zero_area_faces])
         return MeshSolid(surface.vertices, faces)
-    mesh: Any = source
-    if hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
-        return MeshSolid(mesh.vertices, mesh.faces)
-    if isinstance(source, tuple | list) and len(cast("Any", source)) == 2:
-        vertices, faces = cast("Any", source)
-        return MeshSolid(vertices, faces)
-    raise TypeError(
-        "a mesh is a trimesh.Trimesh, a pair (vertices, faces), or the path of a file, not of type "
-        f"{type(mesh).__name__}"
-    )
+    return MeshSolid(*mesh_arrays(source))
 
 
 def looks_like_mesh(candidate: Any) -> bool:
