@@ -149,7 +149,7 @@ def members_of(kind: type) -> Iterator[tuple[str, Any]]:
         if name.startswith("_"):
             continue
         member: Any = getattr(value, "__func__", value)
-        if (isinstance(member, property) or inspect.isfunction(member)) and inspect.getdoc(member):
+        if (isinstance(member, property) or inspect.isfunction(member)) and docstring_of(member):
             yield name, getattr(kind, name)
 
 
@@ -185,9 +185,16 @@ class _Shown:
         return "..." if text.startswith("<") or " at 0x" in text or len(text) > 60 else text
 
 
+def docstring_of(thing: Any) -> str:
+    """The docstring of a class or function, or the one that it inherits; empty if there is none."""
+    text = inspect.getdoc(thing) or ""
+    # From Python 3.13 on, what overrides an attribute that is None inherits None's own docstring.
+    return "" if text == type(None).__doc__ else text
+
+
 def described(thing: Any) -> Iterator[str]:
     """The first paragraph of a docstring, indented."""
-    text = inspect.getdoc(thing) or ""
+    text = docstring_of(thing)
     paragraph = " ".join(text.partition("\n\n")[0].split())
     yield from textwrap.wrap(
         paragraph, _WIDTH, initial_indent="    ", subsequent_indent="    ", break_long_words=False

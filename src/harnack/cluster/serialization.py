@@ -561,16 +561,21 @@ def _make_hashing_pickler(base: Any) -> Callable[..., Any]:
 # Attributes whose values are names, and attributes that contain dictionaries of names.
 _NAME_ATTRIBUTES = ("__name__", "__qualname__", "__module__", "__annotations__")
 _NAMESPACE_ATTRIBUTES = ("__globals__", "__kwdefaults__")
+# Attributes of classes from Python 3.13 on that follow from where and how their code is written.
+_POSITION_ATTRIBUTES = ("__firstlineno__", "__static_attributes__")
 
 
 def _with_encoded_keys(state: Any) -> Any:
     """Return the state of an object, with the names of its attributes as bytes instead of strings.
-    Strings would be taken for names of files, and hashed as such if there is such a file."""
+    Strings would be taken for names of files, and hashed as such if there is such a file. Where a
+    class begins, and the order in which Python has listed attributes, is left out."""
     if isinstance(state, tuple):
         return tuple(map(_with_encoded_keys, cast("tuple[Any, ...]", state)))
     if not isinstance(state, dict):
         return state
     attributes = dict(cast("dict[Any, Any]", state))
+    for key in _POSITION_ATTRIBUTES:
+        attributes.pop(key, None)
     # Some values are names, too, and some are dictionaries of names.
     attributes |= {key: _encoded(attributes[key]) for key in _NAME_ATTRIBUTES if key in attributes}
     attributes |= {

@@ -513,10 +513,33 @@ def parse_scene(text: str, find: Callable[[str], Path] | None = None) -> SceneFi
         data = json.loads(text, parse_constant=_no_number, object_pairs_hook=_reject_duplicate_keys)
     except (ValueError, RecursionError) as wrong:
         raise SceneFileError(f"it is no JSON: {wrong}") from None
+    too_deep = SceneFileError("more things are within each other than can be read")
+    # Python's own limit of recursion, which long programs leave less of, differs among versions.
+    if _is_deeper(data, _MAX_DEPTH):
+        raise too_deep
     try:
         return _scene_of(data, find)
     except RecursionError:
-        raise SceneFileError("more things are within each other than can be read") from None
+        raise too_deep from None
+
+
+# Lists and objects of JSON within each other: a field in a field counts twice.
+_MAX_DEPTH = 500
+
+
+def _is_deeper(data: Any, limit: int) -> bool:
+    """Return whether more than `limit` lists and objects of JSON data are within each other."""
+    layer: list[Any] = [data]
+    for _ in range(limit + 1):
+        layer = [
+            inner
+            for value in layer
+            if isinstance(value, dict | list)
+            for inner in cast("list[Any]", value if isinstance(value, list) else [*value.values()])
+        ]
+        if not layer:
+            return False
+    return True
 
 
 def _scene_of(data: Any, find: Callable[[str], Path] | None) -> SceneFile:
