@@ -405,6 +405,12 @@ def _add_file_options(parser: Any) -> Any:
         help="even out the noise of a point cloud over such lengths, in its own unit, or auto: "
         "by the noise that is measured, with points moved and far ones left out",
     )  # fmt: skip
+    group.add_argument(
+        "--origin", type=_argument(_parse_origin), metavar="{center,file,X,Y,Z}",
+        help="the point of the file that becomes the origin: its middle, its own origin or a point "
+        "(its middle if it is more than 1,000 sizes away, as coordinates of maps are; else its own "
+        "origin)",
+    )  # fmt: skip
     return group
 
 
@@ -430,6 +436,11 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
 def _parse_smoothing(value: str) -> float | str:
     """Return the number that a text gives, a positive length; or "auto", which stays as it is."""
     return value if value == "auto" else text.parse_positive(value)
+
+
+def _parse_origin(value: str) -> str | tuple[float, ...]:
+    """Return "center" or "file" as they are, and any other text as a point."""
+    return value if value in ("center", "file") else text.parse_point(value)
 
 
 def _parse_parameter(value: str) -> tuple[str, float]:
