@@ -292,8 +292,8 @@ def read_geometry(
     than four corners and no two share an edge; polylines without faces are curves, too. Points
     alone make a cloud, with normals from fields that are named so, such as nx ny nz or normal_x
     normal_y normal_z (.ply, .pcd, .las, .laz, .csv), from the same number of `vn` as of `v` (.obj)
-    or from columns 4 to 6 (.xyz). Colors of points are ignored. Polygons are triangulated, the nodes of a scene are
-    transformed to their positions, and faces of zero area are left out.
+    or from columns 4 to 6 (.xyz). Colors of points are ignored. Polygons are triangulated, the
+    nodes of a scene are transformed to their positions, and faces of zero area are left out.
 
     read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
         a mesh the centers of its triangles, with their normals and areas. "loops": the result of

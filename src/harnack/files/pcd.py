@@ -218,8 +218,8 @@ def _read_text(path: Path, data: bytes, header: _Header) -> FloatArray:
 
 
 def _decompress(place: FileLocation, data: bytes) -> bytearray:
-    """Return the unpacked points of a compressed file. data: what follows the header: the packed and
-    the unpacked size in bytes, 32 bits each, and the packed bytes.
+    """Return the unpacked points of a compressed file. data: what follows the header: the packed
+    and the unpacked size in bytes, 32 bits each, and the packed bytes.
 
     Raises:
         FileFormatError: the sizes or the packed bytes are wrong.

@@ -87,7 +87,7 @@ def _separated_by_blanks(lines: TextLines) -> TextLines:
                     f"{excerpt(line)} has commas beside other separators: write numbers with "
                     "decimal points"
                 )
-            line = line.replace(b",", b" ")  # noqa: PLW2901
+            line = line.replace(b",", b" ")
         result.append(line.replace(b";", b" "))
     return TextLines(result, lines.locations)
 

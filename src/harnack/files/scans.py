@@ -35,6 +35,10 @@ _POINT_BYTES = 24
 # The least size of a record of the header, and where the header says how large it is itself, where
 # the points begin, and how many records are before them.
 _RECORD_BYTES, _SIZES_OFFSET = 54, 94
+# How LASzip numbers the way of packing in layers, and the kinds of numbers of a point; and how many
+# layers each kind has. Extra bytes have a layer each.
+_LAYERED, _EXTRA_BYTES = 3, 14
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 
 
 def read_las(path: Path, data: bytes) -> FileGeometry:
@@ -50,13 +54,21 @@ def read_las(path: Path, data: bytes) -> FileGeometry:
     laspy = import_optional("laspy", f"{path.suffix} files are read by laspy: {_INSTALL}")
     _check_las_header(place, data)
     with errors_of_library(place, "LAS"):
-        reader = laspy.open(BytesIO(data), read_evlrs=False)
+        # One thread: several would reserve memory by sizes of chunks that nobody has checked.
+        backend = laspy.LazBackend.Lazrs
+        reader = laspy.open(BytesIO(data), laz_backend=backend, read_evlrs=False)
         header = reader.header
         count, width = int(header.point_count), int(header.point_format.size)
     if not count:
         raise place.error("it holds no points")
     if header.are_points_compressed:
         import_optional("lazrs", f"compressed points are unpacked by lazrs: {_INSTALL}")
+        try:
+            _check_packed_sizes(data, header)
+        except ValueError as error:
+            raise place.error(f"its packed points are damaged: {error}") from None
+        except struct.error:
+            raise place.error("its packed points end too early: the file is truncated") from None
     room = len(data) - int(header.offset_to_point_data)
     if not header.are_points_compressed and count * width > room:
         raise place.error(
@@ -87,6 +99,41 @@ def read_las(path: Path, data: bytes) -> FileGeometry:
         positions = positions[is_kept]
         normals = None if normals is None else normals[is_kept]
     return FileGeometry(path, positions, normals, notes=tuple(notes))
+
+
+def _check_packed_sizes(data: bytes, header: Any) -> None:
+    """Raise a ValueError if sizes in the packed points of a .laz file are larger than the file:
+    lazrs would reserve memory for them.
+
+    The points stand in chunks, behind the position of a table of these. Since LAS 1.4 a chunk is
+    its first point, the number of its points, the sizes of its layers, and the layers: the packed
+    bytes of one of the numbers of all points.
+
+    header: laspy's header.
+    """
+    begin = int(header.offset_to_point_data)
+    (table,) = struct.unpack_from("<q", data, begin)
+    if table == -1:  # written to a stream: the position stands at the end
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    position = begin + 8
+    _, chunks = struct.unpack_from("<II", data, table)
+    if not position <= table < len(data) or chunks > int(header.point_count) + 1:
+        raise ValueError("the table of their chunks is wrong")
+    records = header.vlrs.get("LasZipVlr")
+    if not records:
+        raise ValueError("the record that says how they are packed is missing")
+    record = records[0].record_data
+    (compressor,), (count,) = struct.unpack_from("<H", record), struct.unpack_from("<H", record, 32)
+    if compressor != _LAYERED:
+        return
+    kinds = [struct.unpack_from("<HH", record, 34 + 6 * k) for k in range(count)]
+    point_size = sum(size for _, size in kinds)
+    layers = sum(size if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, size in kinds)
+    while position < table:
+        sizes = struct.unpack_from(f"<{layers}I", data, position + point_size + 4)
+        position += point_size + 4 + 4 * layers + sum(sizes)
+    if position != table:
+        raise ValueError("the sizes of their chunks are wrong")
 
 
 def _las_columns(points: Any, names: tuple[str, str, str]) -> FloatArray:

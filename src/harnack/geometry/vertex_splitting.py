@@ -1,7 +1,7 @@
-"""Splitting the vertices of a triangle mesh, so that a vertex may have several normals or colors: at
-a crease, a file needs a vertex of its own for each side. A corner is one of the three corners of a
-face; row i, column k of an array (m, 3) belongs to corner k of face i. All copies of a vertex stay
-at its position, so a mesh that was closed is closed by positions.
+"""Splitting the vertices of a triangle mesh, so that a vertex may have several normals or colors:
+at a crease, a file needs a vertex of its own for each side. A corner is one of the three corners
+of a face; row i, column k of an array (m, 3) belongs to corner k of face i. All copies of a vertex
+stay at its position, so a mesh that was closed is closed by positions.
 """
 
 from __future__ import annotations
