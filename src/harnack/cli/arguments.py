@@ -14,12 +14,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, cast
 
 from harnack._version import __version__
-from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.field_from_file import UP_AXES
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+from harnack.files.mesh_contents import METERS
 from harnack.live.live_scene import LIVE_MODES
 from harnack.live.sliders import Slider
+from harnack.mesh_to_file import MESH_FILES
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import option_text as text
 from harnack.rendering.option_table import NAMES_ELSEWHERE, Option, options_of
@@ -217,6 +218,12 @@ def _add_mesh(commands: Any) -> None:
         "--scale", type=_argument(text.parse_positive), metavar="FACTOR",
         help="multiply all lengths at the end: millimeters for one unit of the source (1)",
     )  # fmt: skip
+    _add_unit(parser)
+    parser.add_argument(
+        "--vertex-normals", dest="normals_out", action="store_true",
+        help="write normals at vertices, by the field's gradient where it has one, to .ply and "
+        ".obj files (others have none, or always have them)",
+    )  # fmt: skip
     _add_file_options(parser).add_argument(
         "--up", type=_argument(text.parse_choice(*UP_AXES)), metavar="{" + ",".join(UP_AXES) + "}",
         help="axis of the file that points up (of .glb, .gltf and surfaces in .obj y, else z)",
@@ -238,6 +245,7 @@ def _add_repair(commands: Any) -> None:
         "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )
     _add_options(parser, "repair", without=("seed",))
+    _add_unit(parser)
     _add_quiet(parser)
 
 
@@ -262,8 +270,8 @@ def _add_check(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="everything as JSON")
     parser.add_argument(
         "--colors", metavar="FILE",
-        help="write the mesh with its thickness as colors, .ply or .glb (needs --min-thickness): "
-        "red below that thickness, gray from three times that on",
+        help="write the mesh with its thickness as colors to a file of any format but .stl (needs "
+        "--min-thickness): red below that thickness, gray from three times that on",
     )  # fmt: skip
 
 
@@ -412,6 +420,15 @@ def _add_file_options(parser: Any) -> Any:
         "origin)",
     )  # fmt: skip
     return group
+
+
+def _add_unit(parser: Any) -> None:
+    """Add the option --unit, for commands that write a mesh."""
+    parser.add_argument(
+        "--unit", type=_argument(text.parse_choice(*METERS)), metavar="{" + ",".join(METERS) + "}",
+        help="what one unit of the written coordinates is: .3mf and USD files say so, and those of "
+        ".glb files are converted to meters (mm of .3mf, m of .glb, cm of USD files)",
+    )  # fmt: skip
 
 
 def _add_quiet(parser: Any) -> None:

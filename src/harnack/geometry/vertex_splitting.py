@@ -88,9 +88,8 @@ def normals_of_sides(
 
     vertices, faces: (n, 3), (m, 3) the mesh before it was split.
     split: its split vertices, k of them.
-    given: (n, 3) better normals at the vertices of the mesh, of any length and of either sign: the
-        sign is chosen for all of them together, so that most agree with the faces. One is used
-        where it is finite and within 20 degrees of the mean.
+    given: (n, 3) better normals at the vertices of the mesh, of any length and of either sign. One
+        is used where it is finite and, with one of both signs, within 20 degrees of the mean.
     """
     corners = vertices[faces]
     face_normals = unit_normals(corners)
@@ -111,6 +110,5 @@ def normals_of_sides(
     largest = np.where(is_usable, largest, 1.0)
     candidates = unit_rows(candidates / largest[:, None])
     agreement = np.where(is_usable, row_dots(candidates, mean), 0.0)
-    if agreement.sum() < 0:
-        candidates, agreement = -candidates, -agreement
-    return np.where((agreement > _LEAST_AGREEMENT)[:, None], candidates, mean)
+    candidates = np.where((agreement < 0)[:, None], -candidates, candidates)
+    return np.where((np.abs(agreement) > _LEAST_AGREEMENT)[:, None], candidates, mean)
