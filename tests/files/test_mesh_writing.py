@@ -13,6 +13,7 @@ import pytest
 import trimesh
 
 import harnack as hk
+from harnack.cli import main
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.io import write_mesh
@@ -423,3 +424,34 @@ def test_the_same_mesh_makes_the_same_file(tmp_path: Path) -> None:
         for path in paths:
             write_mesh(colored(_BALL, "vertex")[0], path)
         assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+# The command.
+
+
+def test_the_command_writes_units_and_normals_of_the_field(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["mesh", "x^2 + y^2 + z^2 = 1", "--clip", "ball:0,0,0,2", "--tolerance", "0.02",
+               "--scale", "25", "--quiet"]  # fmt: skip
+    path = tmp_path / "a.glb"
+    assert main([*command, "--unit", "mm", "-o", str(path)]) == 0
+    scene: Any = trimesh.load(path)
+    np.testing.assert_allclose(scene.extents, 0.05, rtol=1e-3)
+    positions, normals, _ = normals_in(path)
+    np.testing.assert_allclose(normals, positions / 25, atol=2e-3)
+    # Their directions are those of the gradient, not of the faces.
+    lengths = np.linalg.norm(positions, axis=2, keepdims=True)
+    np.testing.assert_allclose(normals, positions / lengths, atol=1e-5)
+    capsys.readouterr()
+    for more, message in (
+        (["--unit", "mm", "-o", str(tmp_path / "a.stl")], "a .stl file has no unit"),
+        (["--vertex-normals", "-o", str(tmp_path / "a.3mf")], "a .3mf file has no normals"),
+        (["--unit", "km", "-o", str(tmp_path / "a.3mf")], "'km'"),
+    ):
+        try:
+            assert main([*command, *more]) == 1
+        except SystemExit as end:
+            assert end.code == 2
+        assert message in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["a.glb"]
