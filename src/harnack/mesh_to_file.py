@@ -45,7 +45,7 @@ class _Format:
     default_unit: the unit of coordinates if none is asked for; None for a format without units.
     has_normals: whether it has normals at vertices.
     is_for_viewers: whether normals are written unasked, since viewers show facets without them.
-    has_colors, has_face_colors: whether it has colors of vertices, and of faces.
+    has_colors: whether it has colors.
     has_opacity: whether its colors have an opacity.
     """
 
@@ -54,6 +54,16 @@ class _Format:
     is_for_viewers: bool = False
     has_colors: bool = True
     has_opacity: bool = True
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """The names of what the format does not have."""
+        has = {
+            "unit": self.default_unit is not None,
+            "normals at vertices": self.has_normals,
+            "colors": self.has_colors,
+        }
+        return tuple(name for name, is_there in has.items() if not is_there)
 
 
 _USD = _Format("cm", is_for_viewers=True)
@@ -97,14 +107,10 @@ def check_mesh_path(
         raise ValueError(
             f"unit must be {', '.join(METERS)} or None, not {unit!r}{did_you_mean(unit, METERS)}"
         )
-    needed = {
-        "unit": (unit is not None, lambda form: form.default_unit is not None),
-        "normals at vertices": (normals, lambda form: form.has_normals),
-        "colors": (colors, lambda form: form.has_colors),
-    }
-    for noun, (is_needed, has) in needed.items():
-        if is_needed and not has(_FORMATS[kind]):
-            others = [name for name, form in _FORMATS.items() if has(form)]
+    needed = {"unit": unit is not None, "normals at vertices": normals, "colors": colors}
+    for noun, is_needed in needed.items():
+        if is_needed and noun in _FORMATS[kind].lacking:
+            others = [name for name, form in _FORMATS.items() if noun not in form.lacking]
             raise ValueError(
                 f"{target}: a {kind} file has no {noun}; leave out the {noun.split()[0]}, or name "
                 f"it {', '.join(others)}"
@@ -291,7 +297,7 @@ def _write_by_trimesh(path: Path, kind: str, contents: MeshContents, digits: int
             largest = float(np.abs(positions).max())
             digits = max(8, 8 - math.floor(math.log10(largest))) if largest else 8
         options = {"digits": digits, "include_normals": normals is not None, "header": "harnack"}
-        if colors is not None and (colors[:, 3] < 255).any():
+        if colors is not None and not _FORMATS[kind].has_opacity and (colors[:, 3] < 255).any():
             warnings.warn("an .obj file has no opacity: it is left out", stacklevel=4)
     elif kind == ".ply":
         options = {"vertex_normal": normals is not None}

@@ -304,7 +304,7 @@ def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Conte
     if getattr(arguments, "show", None) is None and opened.show != "path":
         given_options["show"] = opened.show
         print_line(f"drawn {opened.show}; --show path follows light paths, in minutes")
-    source = {"file": str(path.resolve())}
+    source: dict[str, Any] = {"file": str(path.resolve())}
     source |= {name: value for name, value in _file_options(arguments).items() if value}
     # The point itself, so that the scene stays where it is if the file gets other points.
     source.pop("origin", None)
