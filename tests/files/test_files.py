@@ -261,7 +261,7 @@ BAD = [
     ("few.ply", ply_text("element vertex 1\n" + VERTEX_HEADER, "0 0\n"), "vertex 0: 2 .* too few"),
     ("lot.ply", ply_text("element vertex 1\n" + VERTEX_HEADER, "0 0 0 0\n"), "4 .* too many"),
     ("nan.ply", ply_text("element vertex 1\n" + VERTEX_HEADER, "0 nan 0\n"), "vertex 0: coord"),
-    ("word.ply", ply_text("element vertex 1\n" + VERTEX_HEADER, "0 x 0\n"), "vertex 0: could not"),
+    ("word.ply", ply_text("element vertex 1\n" + VERTEX_HEADER, "0 x 0\n"), "vertex 0: .x. is no"),
     ("size.ply", ply_text("element face 1\nproperty list int int vertex_index\n", "9 0 1 2\n"),
      "face 0: 4 numbers are too few"),
     ("size2.ply", ply_text("element face 1\nproperty list int int vertex_index\n", "-1 0 1 2\n"),

@@ -11,12 +11,12 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.cli.mesh_files import MESH_FILES, write_mesh
 from harnack.files.file_geometry import FileFormatError
 from harnack.files.geometry_files import LoadedMesh, read_geometry
+from harnack.mesh_to_file import MESH_FILES, write_mesh
 
 
-@pytest.mark.parametrize("kind", MESH_FILES)
+@pytest.mark.parametrize("kind", [k for k in MESH_FILES if not k.startswith(".usd")])
 def test_what_is_written_is_read_closed_and_of_the_same_volume(kind: str, tmp_path: Path) -> None:
     ring = trimesh.creation.torus(8.0, 3.0, major_sections=24, minor_sections=12)
     path = tmp_path / f"ring{kind}"
@@ -25,7 +25,9 @@ def test_what_is_written_is_read_closed_and_of_the_same_volume(kind: str, tmp_pa
     assert found.is_printable
     assert found.volume is not None
     assert math.isclose(found.volume, ring.volume, rel_tol=1e-6)
-    assert np.allclose(found.size, ring.extents, rtol=1e-6)
+    # In a .glb file y is up.
+    x, y, z = ring.extents
+    assert np.allclose(found.size, (x, z, y) if kind == ".glb" else (x, y, z), rtol=1e-6)
     assert math.isclose(hk.mesh(hk.solid(path)).volume, ring.volume, rel_tol=1e-6)
 
 

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 
 import harnack as hk
-from harnack.cli.mesh_files import write_mesh
 from harnack.geometry.example_meshes import bumpy_sphere
+from harnack.mesh_to_file import write_mesh
 from harnack.meshing.checks import check_inside, check_near_level, check_no_self_intersection
 from harnack.meshing.closed_export import ClosedMesh
 from harnack.meshing.finishing import simplify_mesh

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,15 @@ def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["check", name, "--min-thickness", "2.5", "--colors", colors]) == 1
     assert "wrong: thin walls" in capsys.readouterr().out
     assert len(trimesh.load(colors).faces) == len(PLATE.faces)
+    printed = str(tmp_path / "thin.3mf")
+    assert main(["check", name, "--min-thickness", "2.5", "--colors", printed]) == 1
+    capsys.readouterr()
+    with zipfile.ZipFile(printed) as archive:
+        model = archive.read("3D/3dmodel.model").decode()
+    # Gray and red.
+    assert re.findall('<m:color color="(.*?)"/>', model) == ["#BEBEBEFF", "#C81E1EFF"]
+    assert main(["check", name, "--min-thickness", "2.5", "--colors", name]) == 1
+    assert "a .stl file has no colors" in capsys.readouterr().err
     assert main(["check", name, "--json", "--build-volume", "5", "5", "5"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert [one["kind"] for one in found["problems"]] == ["bed"]

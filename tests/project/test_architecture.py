@@ -36,6 +36,7 @@ ROOMS = (
     "distance",
     "meshing",
     "rendering",
+    "mesh_to_file",
     "field_from_file",
     "gallery",
     "live",

@@ -14,14 +14,15 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn, cast
 
 from harnack._version import __version__
-from harnack.cli.mesh_files import MESH_FILES
 from harnack.cli.messages import printable
 from harnack.cli.welcome import print_welcome
 from harnack.field_from_file import UP_AXES
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+from harnack.files.mesh_contents import METERS
 from harnack.gallery import SCENES
 from harnack.live.live_scene import LIVE_MODES
 from harnack.live.sliders import Slider
+from harnack.mesh_to_file import MESH_FILES
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import option_text as text
 from harnack.rendering.option_table import NAMES_ELSEWHERE, Option, options_of
@@ -240,6 +241,12 @@ def _add_mesh(commands: Any) -> None:
         "--scale", type=_argument(text.parse_positive), metavar="FACTOR",
         help="multiply all lengths at the end: millimeters for one unit of the source (1)",
     )  # fmt: skip
+    _add_unit(parser)
+    parser.add_argument(
+        "--vertex-normals", dest="normals_out", action="store_true",
+        help="write normals at vertices, by the field's gradient where it has one, to .ply and "
+        ".obj files (others have none, or always have them)",
+    )  # fmt: skip
     _add_file_options(parser).add_argument(
         "--up", type=_argument(text.parse_choice(*UP_AXES)), metavar="{" + ",".join(UP_AXES) + "}",
         help="axis of the file that points up (of .glb, .gltf and surfaces in .obj y, else z)",
@@ -261,6 +268,7 @@ def _add_repair(commands: Any) -> None:
         "-o", "--output", metavar="FILE", help=f"{', '.join(MESH_FILES)} (FILE-repaired.ply)"
     )
     _add_options(parser, "repair", without=("seed",))
+    _add_unit(parser)
     _add_quiet(parser)
 
 
@@ -285,8 +293,8 @@ def _add_check(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="everything as JSON")
     parser.add_argument(
         "--colors", metavar="FILE",
-        help="write the mesh with its thickness as colors, .ply or .glb (needs --min-thickness): "
-        "red below that thickness, gray from three times that on",
+        help="write the mesh with its thickness as colors to a file of any format but .stl (needs "
+        "--min-thickness): red below that thickness, gray from three times that on",
     )  # fmt: skip
 
 
@@ -457,7 +465,22 @@ def _add_file_options(parser: Any) -> Any:
         help="even out the noise of a point cloud over such lengths, in its own unit, or auto: "
         "by the noise that is measured, with points moved and far ones left out",
     )  # fmt: skip
+    group.add_argument(
+        "--origin", type=_argument(_parse_origin), metavar="{center,file,X,Y,Z}",
+        help="the point of the file that becomes the origin: its middle, its own origin or a point "
+        "(its middle if it is more than 1,000 sizes away, as coordinates of maps are; else its own "
+        "origin)",
+    )  # fmt: skip
     return group
+
+
+def _add_unit(parser: Any) -> None:
+    """Add the option --unit, for commands that write a mesh."""
+    parser.add_argument(
+        "--unit", type=_argument(text.parse_choice(*METERS)), metavar="{" + ",".join(METERS) + "}",
+        help="what one unit of the written coordinates is: .3mf and USD files say so, and those of "
+        ".glb files are converted to meters (mm of .3mf, m of .glb, cm of USD files)",
+    )  # fmt: skip
 
 
 def _add_quiet(parser: Any) -> None:
@@ -482,6 +505,11 @@ def _argument(parse_text: Callable[[str], Any]) -> Callable[[str], Any]:
 def _parse_smoothing(value: str) -> float | str:
     """Return the number that a text gives, a positive length; or "auto", which stays as it is."""
     return value if value == "auto" else text.parse_positive(value)
+
+
+def _parse_origin(value: str) -> str | tuple[float, ...]:
+    """Return "center" or "file" as they are, and any other text as a point."""
+    return value if value in ("center", "file") else text.parse_point(value)
 
 
 def _parse_parameter(value: str) -> tuple[str, float]:

@@ -10,7 +10,7 @@ import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -18,7 +18,6 @@ from rich.console import Console
 from harnack.backend import doctor
 from harnack.cli.demo import check_demo_backend, draw_demo
 from harnack.cli.example_scripts import copy_scripts, example_scripts
-from harnack.cli.mesh_files import check_mesh_path, write_mesh
 from harnack.cli.messages import python_to_cli_terms
 from harnack.cli.sources import (
     is_mitsuba_scene,
@@ -30,17 +29,24 @@ from harnack.cli.sources import (
     print_line,
     source_path,
 )
-from harnack.files.file_geometry import write_atomically
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.gallery import SCENES
 from harnack.geometry.boundary_edges import weld_vertices
 from harnack.live import page, view
+from harnack.mesh_to_file import (
+    check_mesh_path,
+    has_normals_unasked,
+    write_mesh,
+    write_plain_mesh,
+)
 from harnack.meshing import check_print, mesh, repair, wall_thickness
+from harnack.meshing.sign_function import uses_sign_meshing
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import animate, render
 from harnack.rendering.animation import check_film_path
 from harnack.rendering.images import check_picture_path
 from harnack.rendering.option_table import SHORTHAND
+from harnack.tracer import Surface
 
 # Of the pictures of `gallery --demo`, in pixels.
 _SMALL_SIZE = (480, 360)
@@ -106,7 +112,9 @@ def _mesh(arguments: Any) -> int:
     """Run the command `mesh`: write the source's surface as triangles, and print facts about
     them."""
     path = source_path(arguments)
-    target = check_mesh_path(_output(arguments, path, ".stl", "mesh"))
+    target = check_mesh_path(
+        _output(arguments, path, ".stl", "mesh"), unit=arguments.unit, normals=arguments.normals_out
+    )
     surface = load_single_surface(arguments, path)
     given_options = options_set("mesh", arguments)
     # The options of the surface were applied when it was loaded; the tolerance belongs to the mesh,
@@ -118,9 +126,10 @@ def _mesh(arguments: Any) -> int:
     }
     triangles = mesh(surface, progress=not arguments.quiet, **settings)
     facts = triangles.metadata["harnack"]
+    normals = _normals_of_field(surface, triangles, target, arguments)
     if arguments.scale is not None:
         triangles.apply_scale(arguments.scale)
-    write_mesh(triangles, target)
+    write_mesh(triangles, target, unit=arguments.unit, normals=normals)
     is_closed = triangles.is_watertight
     print_line(
         f"{len(triangles.faces):,} triangles, "
@@ -136,12 +145,29 @@ def _mesh(arguments: Any) -> int:
     return 0
 
 
+def _normals_of_field(surface: Any, triangles: Any, target: Path, arguments: Any) -> Any:
+    """Return the normals of a mesh that are written, by the gradient of its field: an array (n, 3);
+    True for those of the faces, where the gradient is of no use; or None if none are written.
+
+    surface: the field or surface whose mesh it is.
+    triangles: the mesh, in the field's unit.
+    target: the file that is written.
+    """
+    if not (arguments.normals_out or has_normals_unasked(target)):
+        return None
+    field = surface.field if isinstance(surface, Surface) else surface
+    # Thick parts are beside the surface; and fields that are meshed by signs are rough on it.
+    if arguments.thickness is not None or uses_sign_meshing(field):
+        return True
+    return field.gradient(triangles.vertices, precision="double")
+
+
 def _repair(arguments: Any) -> int:
     """Run the command `repair`: close a damaged mesh, write it, and print what was changed."""
     import trimesh  # here: half a second that few need
 
     source = Path(arguments.mesh)
-    target = check_mesh_path(arguments.output or f"{source.stem}-repaired.ply")
+    target = check_mesh_path(arguments.output or f"{source.stem}-repaired.ply", unit=arguments.unit)
     loaded = read_geometry(source, "winding")
     if not isinstance(loaded, LoadedMesh):
         raise ValueError(f"{source} holds no mesh to repair")
@@ -152,7 +178,7 @@ def _repair(arguments: Any) -> int:
     used, faces = np.unique(weld_vertices(loaded.vertices)[loaded.faces], return_inverse=True)
     damaged = trimesh.Trimesh(loaded.vertices[used], faces.reshape(-1, 3), process=False)
     repaired = repair(damaged, progress=not arguments.quiet, **given_options)
-    write_mesh(repaired, target)
+    write_mesh(repaired, target, unit=arguments.unit)
     facts = repaired.metadata["harnack"]
     if facts["differs"] is not None:
         print_line(
@@ -211,8 +237,7 @@ def _check(arguments: Any) -> int:
             raise ValueError(
                 "--colors needs --min-thickness: the thickness below which they are red"
             )
-        if check_mesh_path(arguments.colors).suffix.lower() not in (".ply", ".glb"):
-            raise ValueError(f"--colors {arguments.colors}: only .ply and .glb hold colors")
+        check_mesh_path(arguments.colors, colors=True)
     report = check_print(
         arguments.mesh, min_thickness=arguments.min_thickness, build_volume=arguments.build_volume
     )
@@ -228,12 +253,10 @@ def _check(arguments: Any) -> int:
             print_line("nothing is wrong")
     if arguments.colors is not None:
         walls = wall_thickness(arguments.mesh)
-        with write_atomically(Path(arguments.colors)) as partial:
-            kind = Path(arguments.colors).suffix.lower()[1:]
-            # Red below the smallest thickness, gray from three times that on.
-            cast(
-                "Any", walls.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
-            ).export(partial, kind)
+        # Red below the smallest thickness, gray from three times that on. As it is, since the mesh
+        # may be wrong.
+        colored = walls.to_colored_mesh(arguments.min_thickness, 3 * arguments.min_thickness)
+        write_plain_mesh(colored, Path(arguments.colors))
         if not arguments.json:
             print_line(f"wrote {arguments.colors}")
     return 0 if report.is_printable else 1

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from harnack.cli.arguments import CAMERA_OPTIONS
 from harnack.cli.messages import printable, python_to_cli_terms
-from harnack.field_from_file import FILE_OPTIONS, field_from_file
+from harnack.field_from_file import FILE_OPTIONS, FieldFromFile, field_from_file
 from harnack.fields import Field
 from harnack.fields.expressions import expression, looks_like_formula
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES
@@ -222,8 +222,7 @@ def load_single_surface(arguments: Any, path: Path) -> Field | Surface:
     elif path.suffix.lower() == ".json":
         surfaces = read_scene(path).surfaces_with_options
     else:
-        opened = field_from_file(path, **_file_options(arguments))
-        print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
+        opened = _open(path, arguments)
         if arguments.smoothing == "auto":
             print_line(_described(opened.field))
         surfaces = [opened.field]
@@ -300,21 +299,34 @@ def _of_file(path: Path, arguments: Any, given_options: dict[str, Any]) -> Conte
     the file was taken for is printed. given_options: the options that were given, by name."""
     # `up` turns the field when the file is read, so it is no option of the picture.
     given_options = {name: value for name, value in given_options.items() if name != "up"}
-    opened = field_from_file(path, **_file_options(arguments))
-    print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
+    opened = _open(path, arguments)
     print_line(_described(opened.field))
     if getattr(arguments, "show", None) is None and opened.show != "path":
         given_options["show"] = opened.show
         print_line(f"drawn {opened.show}; --show path follows light paths, in minutes")
-    source = {"file": str(path.resolve())}
+    source: dict[str, Any] = {"file": str(path.resolve())}
     source |= {name: value for name, value in _file_options(arguments).items() if value}
+    # The point itself, so that the scene stays where it is if the file gets other points.
+    source.pop("origin", None)
+    if any(opened.origin):
+        source["origin"] = list(opened.origin)
     settings = {"material": opened.material, **_camera(arguments, Camera()), **given_options}
     return opened.field, settings, [(opened.field, source)]
 
 
+def _open(path: Path, arguments: Any) -> FieldFromFile:
+    """Return the field of a surface file, and print what the file was taken for."""
+    opened = field_from_file(path, **_file_options(arguments))
+    print_line(f"{path}: {python_to_cli_terms(opened.summary)}")
+    return opened
+
+
 def _file_options(arguments: Any) -> dict[str, Any]:
-    """Return the options for surface files, by name, also those that were not given."""
-    return {name: getattr(arguments, name) for name in FILE_OPTIONS}
+    """Return the options for surface files, by name, also those that were not given. What is far
+    from its origin is moved unless that was decided otherwise."""
+    options = {name: getattr(arguments, name) for name in FILE_OPTIONS}
+    origins = {None: "auto", "file": None}
+    return options | {"origin": origins.get(options["origin"], options["origin"])}
 
 
 def _refuse_file_options(arguments: Any) -> None:

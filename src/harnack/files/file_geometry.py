@@ -107,6 +107,7 @@ class FileGeometry:
     normals: (n, 3) normals of the vertices, or None.
     faces: closed polygons; the last corner of each is joined to the first.
     polylines: chains of edges, each closed only if its last index equals its first.
+    notes: short texts about what the file holds and is not used, for the summary of a point cloud.
 
     All indices lie in [0, n).
     """
@@ -116,6 +117,7 @@ class FileGeometry:
     normals: FloatArray | None = None
     faces: PolygonList = NO_POLYGONS
     polylines: PolygonList = NO_POLYGONS
+    notes: tuple[str, ...] = ()
 
 
 def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
@@ -126,16 +128,17 @@ def triangles_as_polygons(path: Path, corners: IntArray) -> PolygonList:
 
 
 @contextlib.contextmanager
-def errors_of_trimesh(place: FileLocation, kind: str) -> Generator[None, None, None]:
-    """A context in which any error, such as trimesh raises for malformed files, becomes a
+def errors_of_library(place: FileLocation, kind: str) -> Generator[None, None, None]:
+    """A context in which any error, such as libraries raise for malformed files, becomes a
     FileFormatError that says that `place` is no sound file of this kind; warnings are silenced."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except FileFormatError:
+    except (FileFormatError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
-    except Exception as error:
+    # Libraries that are written in Rust raise a BaseException where they find a fault of their own.
+    except BaseException as error:
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise place.error(f"it is no sound {kind} file ({reason[0][:120]})") from None
 

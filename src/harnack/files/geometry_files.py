@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -20,7 +20,10 @@ from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import FileFormatError, FileGeometry, FileLocation, read_bytes
 from harnack.files.gltf import read_gltf
 from harnack.files.molecules import MOLECULE_FILES, Atoms, parse_molecule
+from harnack.files.pcd import read_pcd
 from harnack.files.ply import read_ply
+from harnack.files.point_tables import read_point_table
+from harnack.files.scans import read_e57, read_las
 from harnack.files.text_formats import (
     Metaballs,
     read_loops_text,
@@ -28,7 +31,6 @@ from harnack.files.text_formats import (
     read_obj,
     read_off,
     read_stl,
-    read_xyz,
 )
 from harnack.files.three_mf import read_3mf
 from harnack.geometry.boundary_edges import (
@@ -213,7 +215,9 @@ _READ_AS = ("winding", "dipole", "loops", "polygons")
 
 _READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
     ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
-    ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_xyz,
+    ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_point_table,
+    ".txt": read_point_table, ".csv": read_point_table, ".pts": read_point_table,
+    ".pcd": read_pcd, ".las": read_las, ".laz": read_las, ".e57": read_e57,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")
 GEOMETRY_SUFFIXES = (*_READERS, ".loops", ".blobs", *MOLECULE_FILES)
@@ -277,24 +281,30 @@ LoadedGeometry: TypeAlias = (
 )
 
 
-def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -> LoadedGeometry:
+def read_geometry(
+    path: str | os.PathLike[str], read_as: ReadAs | None = None, *, ignore_normals: bool = False
+) -> LoadedGeometry:
     """Read the surface, cloud, curves, blobs or molecule in a file: .obj, .ply, .stl, .off, .glb,
-    .gltf, .3mf, .xyz, .loops, .blobs; molecules .pdb, .ent, .cif, .mmcif.
+    .gltf, .3mf; clouds .las, .laz, .e57, .pcd, .xyz, .txt, .csv, .pts; .loops, .blobs; molecules
+    .pdb, .ent, .cif, .mmcif.
 
     Faces make a mesh. But the polygons of an .obj or .ply file are curves if one of them has more
     than four corners and no two share an edge; polylines without faces are curves, too. Points
-    alone make a cloud, with normals from nx ny nz (.ply), from the same number of `vn` as of `v`
-    (.obj) or from columns 4 to 6 (.xyz). Polygons are triangulated, the nodes of a scene are
-    transformed to their positions, and faces of zero area are left out.
+    alone make a cloud, with normals from fields that are named so, such as nx ny nz or normal_x
+    normal_y normal_z (.ply, .pcd, .las, .laz, .csv), from the same number of `vn` as of `v` (.obj)
+    or from columns 4 to 6 (.xyz). Colors of points are ignored. Polygons are triangulated, the
+    nodes of a scene are transformed to their positions, and faces of zero area are left out.
 
     read_as: what to make of the contents. "winding": the faces, as a mesh. "dipole": the points; of
         a mesh the centers of its triangles, with their normals and areas. "loops": the result of
         `read_loops`; of a mesh its boundary: the edges at which its faces do not cancel, joined to
         curves. "polygons": the faces, not triangulated. None decides as above.
+    ignore_normals: whether to leave out the normals of a point cloud, also wrong ones.
 
     Raises:
         FileFormatError: the file is unreadable, malformed, truncated or hostile, has another
             format, or contains nothing that can be read in this way.
+        ModuleNotFoundError: a package that the format needs is not installed.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -309,12 +319,16 @@ def read_geometry(path: str | os.PathLike[str], read_as: ReadAs | None = None) -
         )
     # Very large numbers may overflow before the check that refuses them.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _read_geometry(path, kind, read_as)
+        return _read_geometry(path, kind, read_as, ignore_normals)
 
 
-def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeometry:
+def _read_geometry(
+    path: Path, kind: str, read_as: ReadAs | None, ignore_normals: bool
+) -> LoadedGeometry:
     """Read a file of the format `kind` (an extension such as ".obj") in the way `read_as`. This is
     the work of `read_geometry` after both have been checked.
+
+    ignore_normals: whether to leave out the normals of a point cloud.
 
     Raises:
         FileFormatError: the file cannot be read, or not in this way.
@@ -341,7 +355,7 @@ def _read_geometry(path: Path, kind: str, read_as: ReadAs | None) -> LoadedGeome
             why = "points joined in their order, as asked: a curve"
             return _as_curves(closed_curves_of(contents), why)
         _check_convertible(path, read_as, ("dipole",), "points")
-        return _cloud(contents)
+        return _cloud(replace(contents, normals=None) if ignore_normals else contents)
     except (MeshError, CloudError) as error:
         raise FileLocation(path).error(str(error)) from error
 
@@ -496,14 +510,15 @@ def _cloud(contents: FileGeometry) -> LoadedCloud:
     """Make a point cloud of the vertices of a file without faces, with their normals if it has
     them."""
     points = as_cloud_points(contents.vertices)
-    count_text = f"{len(points):,} points"
+    count_text, notes = f"{len(points):,} points", "".join(f"; {note}" for note in contents.notes)
     if contents.normals is None:
-        summary = f"{count_text} without faces, and no normals read: a point cloud"
+        summary = f"{count_text} without faces, and no normals read: a point cloud{notes}"
         # (None: neither normals nor areas.)
         return LoadedCloud(points, None, None, summary)
     normals = as_unit_normals(contents.normals, len(points))
+    summary = f"{count_text} with normals, no faces: a point cloud{notes}"
     # (None: no areas.)
-    return LoadedCloud(points, normals, None, f"{count_text} with normals, no faces: a point cloud")
+    return LoadedCloud(points, normals, None, summary)
 
 
 def _as_curves(loops: list[FloatArray], reason: str) -> LoadedCurves:

@@ -24,7 +24,7 @@ from harnack.files.file_geometry import (
     MAX_BYTES,
     FileGeometry,
     FileLocation,
-    errors_of_trimesh,
+    errors_of_library,
     joined_meshes,
     placed_mesh,
     read_bytes,
@@ -58,7 +58,7 @@ def read_gltf(path: Path, data: bytes) -> FileGeometry:
 
     place = FileLocation(path)
     header = _header(place, data)
-    with errors_of_trimesh(place, "glTF"):
+    with errors_of_library(place, "glTF"):
         files = _buffer_files(path, header)
         _check_header(place, header, len(data) + sum(map(len, files.values())))
         scene: Any = trimesh.load(

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from harnack.backend import IntArray
+from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import (
     NO_POLYGONS,
     FileFormatError,
@@ -32,7 +32,14 @@ from harnack.files.file_geometry import (
     check_indices,
     have_mixed_sizes,
 )
-from harnack.files.text_tables import TextLines, excerpt, read_floats, split_content_lines
+from harnack.files.point_fields import find_normals, find_positions, unused_notes
+from harnack.files.text_tables import (
+    TextLines,
+    excerpt,
+    parse_any_number,
+    read_floats,
+    split_content_lines,
+)
 from harnack.geometry.flat_lists import ranks_in_lists
 
 # PLY name of a type -> its code in `struct`
@@ -139,7 +146,7 @@ class TextValues:
     """
 
     def __init__(self, rows: TextLines) -> None:
-        numbers, self.counts = read_floats(rows, convert=_any_number)
+        numbers, self.counts = read_floats(rows, convert=parse_any_number)
         self._numbers = np.append(numbers, 0.0)
         self.size = len(numbers)
 
@@ -161,15 +168,6 @@ class TextValues:
 
 
 Values: TypeAlias = BinaryValues | TextValues
-
-
-def _any_number(word: bytes, place: FileLocation) -> float:
-    """Return the number that a word (an entry between blanks) stands for, also NaN or infinite.
-    Raises a FileFormatError that names its `place` if it stands for none."""
-    try:
-        return float(word)
-    except ValueError as error:
-        raise place.error(str(error)[:80]) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +209,12 @@ class ElementTable:
             raise self._wrong_kind_error()
         return self.values.read(column.positions + column.offset, column.code)
 
+    def vectors(self, x: str, y: str, z: str) -> FloatArray:
+        """Return the vectors (n, 3) whose components are the columns with these names. Raises a
+        FileFormatError if there is no such column, or if it holds lists."""
+        columns = [self.scalar_column(name) for name in (x, y, z)]
+        return np.stack(columns, axis=1).astype(np.float64)
+
     def list_column(self, name: str) -> tuple[npt.NDArray[Any], IntArray]:
         """Return the numbers of a column of lists: all lists in one array, one list after the
         other; and the length (n,) of each list. Raises a FileFormatError if there is no such
@@ -237,7 +241,8 @@ class ElementTable:
 
 def read_ply(path: Path, data: bytes) -> FileGeometry:
     """Read the bytes `data` of a .ply file. The result has its vertices, with their normals if they
-    have nx, ny and nz; its faces; and its edges, as polylines with two vertices.
+    have nx, ny and nz, or other names that programs give to normals (`point_fields`); its faces;
+    and its edges, as polylines with two vertices.
 
     Raises:
         FileFormatError: the header is malformed, the file has fewer data than it declares, or an
@@ -246,15 +251,14 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     header = _header(path, data)
     _check_elements(path, header)
     tables = (_binary_tables if header.byte_order else _text_tables)(path, data, header)
-    vertices, normals = np.zeros((0, 3)), None
+    vertices, normals, notes = np.zeros((0, 3)), None, ()
     if table := tables.get("vertex"):
-        vertices = np.stack([table.scalar_column(name) for name in "xyz"], axis=1).astype(
-            np.float64
-        )
+        vertices = table.vectors(*(find_positions(table.columns) or "xyz"))
         check_finite(vertices, table.places)
-        if table.has_scalars("nx", "ny", "nz"):
-            columns = [table.scalar_column(name) for name in ("nx", "ny", "nz")]
-            normals = np.stack(columns, axis=1).astype(np.float64)
+        names = find_normals(table.columns)
+        if names is not None and table.has_scalars(*names):
+            normals = table.vectors(*names)
+        notes = unused_notes(table.columns)
     faces = edges = NO_POLYGONS
     if table := tables.get("face"):
         name = "vertex_index" if "vertex_index" in table.columns else "vertex_indices"
@@ -268,7 +272,7 @@ def read_ply(path: Path, data: bytes) -> FileGeometry:
     # Faces of different sizes are handled one by one, which takes long.
     if have_mixed_sizes(faces):
         check_element_count(FileLocation(path), header.declared_rows(len(data)))
-    return FileGeometry(path, vertices, normals, faces, edges)
+    return FileGeometry(path, vertices, normals, faces, edges, notes)
 
 
 def _check_elements(path: Path, header: PlyHeader) -> None:

@@ -1,5 +1,5 @@
-"""Reading geometry files in text formats: .xyz, .loops, .blobs, .obj, .off and .stl (.stl may also
-be binary). Each reader takes the path of a file, for messages, and `data`, the bytes of the file. A
+"""Reading geometry files in text formats: .loops, .blobs, .obj, .off and .stl (.stl may also be
+binary). Each reader takes the path of a file, for messages, and `data`, the bytes of the file. A
 "statement" is a line of an .obj file, whose first word says what it defines. Errors are
 FileFormatErrors that name the line."""
 
@@ -35,44 +35,6 @@ from harnack.files.text_tables import (
 )
 from harnack.geometry.boundary_edges import weld_vertices
 from harnack.geometry.flat_lists import ranks_in_lists
-
-
-def read_xyz(path: Path, data: bytes) -> FileGeometry:
-    """Read an .xyz file, with a point on each line: positions from columns 1 to 3, and normals from
-    columns 4 to 6 if there are six columns or more.
-
-    Further columns are ignored. `#` begins a comment.
-
-    Raises:
-        FileFormatError: lines have different numbers of columns, or fewer than three; a word is not
-            a finite number; or columns 4 to 6 are not normals, as their lengths are far from 1.
-    """
-    lines = split_content_lines(path, data)
-    if not len(lines):
-        raise FileLocation(path).error("it holds no points: write one a line, x y z")
-    numbers, counts = read_floats(lines)
-    columns = int(counts[0])
-    # All lines must have as many columns as the first.
-    ragged = np.flatnonzero(counts != columns)
-    if ragged.size:
-        raise lines.locations[ragged[0]].error(
-            f"{counts[ragged[0]]} columns, but the lines before have {columns}"
-        )
-    if columns < 3:
-        raise lines.locations[0].error(f"a point needs three coordinates, not {columns}")
-    table = numbers.reshape(-1, columns)
-    if columns < 6:
-        return FileGeometry(path, table[:, :3])
-    normals = table[:, 3:6]
-    length = np.linalg.norm(normals, axis=1)
-    # Normals with few digits are not exactly of unit length.
-    wrong = np.flatnonzero(np.abs(length - 1.0) > 0.1)
-    if wrong.size:
-        raise lines.locations[wrong[0]].error(
-            f"columns 4 to 6 should be a unit normal, but their length is {length[wrong[0]]:.3g}: "
-            "remove these columns if they are colors or the like"
-        )
-    return FileGeometry(path, table[:, :3], normals)
 
 
 def read_loops_text(path: Path, data: bytes) -> list[tuple[FloatArray, FileLocation]]:

@@ -22,6 +22,7 @@ from harnack.files.file_geometry import FileLocation, FileLocations
 __all__ = [
     "TextLines",
     "excerpt",
+    "parse_any_number",
     "parse_finite",
     "parse_vertex_index",
     "read_floats",
@@ -101,6 +102,19 @@ def parse_finite(word: bytes, place: FileLocation) -> float:
     if not math.isfinite(value):
         raise place.error(f"coordinates must be finite, not {excerpt(word)}")
     return value
+
+
+def parse_any_number(word: bytes, place: FileLocation) -> float:
+    """Return the number that a word of a text file stands for, also NaN or infinite. place: the
+    word's location, for the error.
+
+    Raises:
+        FileFormatError: the word is not a number.
+    """
+    try:
+        return float(b"" if b"_" in word else word)  # Python reads 1_0 as 10
+    except ValueError:
+        raise place.error(f"{excerpt(word)} is not a number") from None
 
 
 def parse_vertex_index(word: bytes, place: FileLocation) -> int:

@@ -19,7 +19,7 @@ from harnack.files.file_geometry import (
     FileLocations,
     check_finite,
     check_indices,
-    errors_of_trimesh,
+    errors_of_library,
     joined_meshes,
     placed_mesh,
     triangles_as_polygons,
@@ -64,7 +64,7 @@ def read_3mf(path: Path, data: bytes) -> FileGeometry:
         raise place.error("this is no .3mf file: it is no zip archive") from None
     if size > MAX_BYTES:
         raise place.error(f"it has {size:,} bytes when unpacked: at most {MAX_BYTES:,} are read")
-    with errors_of_trimesh(place, "3MF"):
+    with errors_of_library(place, "3MF"):
         scene: Any = trimesh.load(BytesIO(data), file_type="3mf", force="scene", process=False)
         return _contents(place, scene)
 

@@ -12,11 +12,11 @@ A scene file is JSON of version 1. Nothing in it is ever run, and what is not kn
 A field is one of {"curves": loops of points, "lift_bound": ..., "cells": true or false},
 {"formula": text, "parameters": numbers by name},
 {"scene": a name of the gallery, "number": which of its surfaces}, {"file": a surface file,
-"read_as": ..., "take_boundary": ..., "normals": ..., "smoothing": ..., "up": ...}, or the name of a
-class and its arguments, as {"Sphere": {"radius": 2}}. Beside it stand the keywords of `Surface`;
-{"scene": ..., "number": ...} in place of a field and its keywords is a surface of the gallery with
-its own. Under "settings" stand the options of `render` and of traces, by the names that they have
-in Python (`rendering.option_table`).
+"read_as": ..., "take_boundary": ..., "normals": ..., "smoothing": ..., "up": ..., "origin": ...},
+or the name of a class and its arguments, as {"Sphere": {"radius": 2}}. Beside it stand the
+keywords of `Surface`; {"scene": ..., "number": ...} in place of a field and its keywords is a
+surface of the gallery with its own. Under "settings" stand the options of `render` and of traces,
+by the names that they have in Python (`rendering.option_table`).
 """
 
 from __future__ import annotations

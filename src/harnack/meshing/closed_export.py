@@ -74,18 +74,28 @@ class ClosedMesh(trimesh.Trimesh):
             MeshingError: the mesh is closed, but would not be in the file: components touch, or the
                 mesh is too small or too far from the origin for single precision.
         """
+        written, digits = self.rounded_for_file()
+        name = file_type or str(getattr(file_obj, "name", file_obj))
+        # Text files need as many decimals as 2^-k has to be exact.
+        if digits is not None and name.lower().endswith(("obj", "off")):
+            options.setdefault("digits", digits)
+        return cast("Any", written).export(file_obj, file_type, **options)
+
+    def rounded_for_file(self) -> tuple[trimesh.Trimesh, int | None]:
+        """The mesh without its metadata, rounded to what files hold if it is closed; and how many
+        decimals its coordinates then have, None if it is not closed.
+
+        Raises:
+            MeshingError: as for `export`.
+        """
         written = trimesh.Trimesh.copy(self)
         written.metadata.clear()
         if self.units is not None:
             written.units = self.units
-        if self.is_watertight:
-            grid_spacing = _grid_spacing(np.asarray(self.vertices, np.float64))
-            written = _quantize(written, grid_spacing)
-            name = file_type or str(getattr(file_obj, "name", file_obj))
-            # Text files need as many decimals as 2^-k has to be exact.
-            if name.lower().endswith(("obj", "off")):
-                options.setdefault("digits", max(1, round(-math.log2(grid_spacing))))
-        return cast("Any", written).export(file_obj, file_type, **options)
+        if not self.is_watertight:
+            return written, None
+        grid_spacing = _grid_spacing(np.asarray(self.vertices, np.float64))
+        return _quantize(written, grid_spacing), max(1, round(-math.log2(grid_spacing)))
 
 
 def _grid_spacing(x: FloatArray) -> float:

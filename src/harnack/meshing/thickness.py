@@ -111,8 +111,8 @@ class WallThickness:
 
     def to_colored_mesh(self, low: float, high: float) -> trimesh.Trimesh:
         """The mesh with a color for each face, by its thickness: red up to the thickness `low`,
-        gray from `high` on, and between them a gradient from red over yellow to gray. PLY and GLB
-        files hold such colors.
+        gray from `high` on, and between them a gradient from red over yellow to gray.
+        `hk.io.write_mesh` writes such colors to files of every format but STL.
         """
         import trimesh  # imported here: it takes half a second
 

@@ -208,7 +208,8 @@ def check_offset(points: FloatArray) -> None:
     message = (
         f"what is drawn is {size:.4g} long and {distance:.4g} from the origin, and pictures are "
         "computed in single precision: {}; move it to the origin: subtract its center from the "
-        "points that it is made of (of a solid, translated(...) does so)"
+        "points that it is made of (of a solid, translated(...) does so, of a surface file "
+        'origin="center")'
     )
     if distance > _MAX_OFFSET * size:
         raise ValueError(message.format("too little is left of its coordinates"))
