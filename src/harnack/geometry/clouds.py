@@ -495,9 +495,12 @@ def _spanning_forest(planes: _TangentPlanes) -> tuple[IntArray, IntArray]:
         weight[rows] = np.maximum(1.0 - agreement, 0.0).reshape(-1, k) + 1e-9
 
     parallel_over_slices(weigh_edges, n)
-    # The matrix of the graph in compressed rows: k entries for each point.
-    row_starts = np.arange(0, n * k + 1, k, dtype=np.int64)
-    graph = sparse.csr_array((weight.ravel(), nearest.ravel(), row_starts), shape=(n, n))
+    # The matrix of the graph in compressed rows: k entries for each point. SciPy before 1.16 finds
+    # spanning trees with 32-bit indices only.
+    index_type = np.int32 if n * k < 2**31 else np.int64
+    row_starts = np.arange(0, n * k + 1, k, dtype=index_type)
+    columns = nearest.ravel().astype(index_type)
+    graph = sparse.csr_array((weight.ravel(), columns, row_starts), shape=(n, n))
     forest = sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     _, component = sparse.csgraph.connected_components(forest, directed=False)
     # An additional node is joined to all roots, so that one search from it visits all points.

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, cast
+from typing import Any, cast, get_origin
 
 import numpy as np
 
@@ -842,6 +842,7 @@ def _constructible_types() -> dict[str, type]:
         for name, kind in vars(module).items():
             if (
                 inspect.isclass(kind)
+                and get_origin(kind) is None  # tuple[float, ...] counts as a class in Python 3.10
                 and issubclass(kind, Solid | Volume | SpaceMap)
                 and dataclasses.is_dataclass(kind)
                 and not name.startswith("_")
