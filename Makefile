@@ -72,7 +72,9 @@ test-interop: $(STAMP)
 	test -e .venv/blender || $(BIN)/python -m venv --without-pip .venv/blender
 	$(BIN)/python -m pip --python .venv/blender install --quiet --disable-pip-version-check $(BLENDER)
 	$(BIN)/python -m pip check
-	$(BIN)/python -m pytest -q -n auto -m interop tests/project/test_interoperability.py
+	$(BIN)/python -c "import pxr, pye57"
+	$(BIN)/python -m pytest -q -n auto -m "interop or slow or not slow" tests/project/test_interoperability.py \
+	  tests/files/test_scans.py tests/files/test_mesh_writing.py
 
 # Chromium draws pages and views, with a GPU that is computed on the CPU; pictures go to out/browser.
 test-browser: $(STAMP)

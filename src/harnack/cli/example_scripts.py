@@ -8,7 +8,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import harnack
 from harnack.files.file_geometry import write_atomically
 
 
@@ -47,7 +46,7 @@ def _scripts_folder() -> Path:
     """Return the folder of the example scripts: within the installed package or, if the package is
     used from the repository, that of the repository. Raises a FileNotFoundError if there is none.
     """
-    package = Path(harnack.__file__).parent
+    package = Path(__file__).resolve().parent.parent
     # The second is beside `src`.
     for folder in (package / "examples", package.parents[1] / "examples"):
         if (folder / "spanning_surface.py").is_file():
