@@ -315,7 +315,8 @@ def test_examples_have_a_title_and_no_files_of_the_repository() -> None:
 def test_examples_that_are_missing_are_said_to_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("harnack.__file__", str(tmp_path / "src" / "harnack" / "__init__.py"))
+    module = tmp_path / "src" / "harnack" / "cli" / "example_scripts.py"
+    monkeypatch.setattr("harnack.cli.example_scripts.__file__", str(module))
     code, _, complaint = run(capsys, "examples", "--list")
     assert code == 1
     assert "install harnack again" in complaint
