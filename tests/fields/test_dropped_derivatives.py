@@ -138,8 +138,8 @@ WITH_DERIVATIVES = {("Surface", "field"), ("Surface", "level")} | {
 OTHERS = {
     "atan2", "maximum", "minimum", "norm", "union", "intersection", "animate", "render", "page",
     "check_print", "mesh", "read_scene", "repair", "view", "wall_thickness",
-    "wrap_for_jax", "wrap_for_torch", "write_scene", "choose_enclosures", "field_from_file",
-    "traced_surface",
+    "wrap_for_jax", "wrap_for_torch", "write_mesh", "write_scene", "choose_enclosures",
+    "field_from_file", "traced_surface",
 }  # fmt: skip
 FUNCTIONS = {
     name: value

@@ -450,10 +450,10 @@ def test_formats_whose_packages_lack_are_refused_early(
 
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "lxml" else found(name)
+        importlib.util, "find_spec", lambda name: None if name == "pxr" else found(name)
     )
-    assert main(["mesh", "trefoil", "-o", str(tmp_path / "a.3mf")]) == 1
-    assert "pip install 'harnack[3mf]'" in capsys.readouterr().err
+    assert main(["mesh", "trefoil", "-o", str(tmp_path / "a.usda")]) == 1
+    assert "pip install 'harnack[usd]'" in capsys.readouterr().err
 
 
 @pytest.mark.few(4)

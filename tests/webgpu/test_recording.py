@@ -16,9 +16,9 @@ from harnack.webgpu import record_kernel
 # In a process of its own, since the lock that it is about stops all threads.
 _SCRIPT = """
 import faulthandler, gc, sys, threading
-import drjit as dr
 from harnack.backend import choose_backend
 from harnack.webgpu.recording import record_kernel
+import drjit as dr
 
 faulthandler.dump_traceback_later(50, exit=True)
 real = choose_backend("single").Float
