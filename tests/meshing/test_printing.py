@@ -446,12 +446,8 @@ def test_files_of_every_format_are_closed_when_read_again(kind: str, tmp_path: P
 def test_formats_whose_packages_lack_are_refused_early(
     monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path
 ) -> None:
-    import importlib.util
-
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "pxr" else found(name)
-    )
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    monkeypatch.delitem(sys.modules, "pxr.Usd", raising=False)
     assert main(["mesh", "trefoil", "-o", str(tmp_path / "a.usda")]) == 1
     assert "pip install 'harnack[usd]'" in capsys.readouterr().err
 
