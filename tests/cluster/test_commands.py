@@ -13,6 +13,7 @@ from harnack.cli import main
 from harnack.rendering import register
 
 
+@pytest.mark.slow
 def test_pages_are_the_same(client: Any, tmp_path: Path) -> None:
     one, two = tmp_path / "a.html", tmp_path / "b.html"
     settings: dict[str, Any] = {"r": hk.Slider(0.5, 1.0, step=0.1), "progress": False}

@@ -33,6 +33,7 @@ def directions() -> Any:
     return da.from_array(DIRECTIONS, chunks=(300, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", FIELDS, ids=lambda field: type(field).__name__)
 def test_blocks_give_what_whole_arrays_give(field: hk.Field, points: Any, directions: Any) -> None:
     for name, more in (("value", {}), ("gradient", {"precision": "double"}), ("hessian", {})):

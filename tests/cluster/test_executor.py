@@ -56,6 +56,7 @@ class Squares:
         return {"square": np.array(k * k)}
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("way", WAYS, ids=str)
 def test_workers_draw_the_same_picture(way: dict[str, Any], client: Any) -> None:
     alone = hk.render(POLYGON, **SMALL, **way)
@@ -84,6 +85,7 @@ print(np.array_equal(alone, there), (alone[..., 0] == alone[..., 1]).all())
     assert_same(one, hk.render(POLYGON, show="path", spp=4, **SMALL))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("way", WAYS[:2], ids=str)
 def test_a_checkpoint_spares_what_is_done(
     way: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

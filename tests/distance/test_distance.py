@@ -939,6 +939,7 @@ def test_distances_from_very_far_away_come_without_warnings_of_numpy(far: float)
 _ATOL_CREASE = 1e-9
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("point", "expected"),
     [
@@ -958,6 +959,7 @@ def test_distance_of_a_union_beside_its_crease(point: Any, expected: float) -> N
     assert signed_distance(solid, points)[row] == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_distances_inside_a_lens_are_exact_at_its_edge() -> None:
     """The lens of two unit spheres, also as the complement of the union of their complements: the
     nearest point of a point in the middle plane is on the edge or on a cap."""

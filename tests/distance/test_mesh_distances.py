@@ -363,6 +363,7 @@ def test_meshes_with_holes(
     assert (w.max(axis=1) > 0.5 - 1e-3).all()
 
 
+@pytest.mark.slow
 def test_levels_that_others_are_modulo_one() -> None:
     """What spans a hole has the level of w, and not one that differs by a whole number: a second
     sphere, twice, inside out and open, has the level -1/2 there."""
@@ -403,6 +404,7 @@ def test_feet_are_where_the_level_comes() -> None:
     assert (found.lower <= exact).all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("level", [0.7, 1.5, -0.7])
 def test_one_triangle_has_no_level_beyond_a_half(level: float) -> None:
     field = hk.WindingNumber([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])

@@ -386,6 +386,7 @@ def test_no_dense_sample_is_nearer_in_many_points(name: str, where: str) -> None
     assert (found.upper <= nearest + 1e-4 * size).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [None, True])
 def test_feet_on_clouds_are_on_the_exact_surface(cells: Any) -> None:
     """They come from sums with clusters, which leave out 1e-4 of the size here, and are moved by

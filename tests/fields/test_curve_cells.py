@@ -249,6 +249,7 @@ def sampled(field: hk.SolidAngle, x: np.ndarray, precision: Precision, plan: Pla
     return tuple(to_numpy(one).astype(np.float64) for one in numbers)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", CURVES)
 def test_errors_are_bounded(name: str, precision: Precision) -> None:
@@ -389,6 +390,7 @@ def rays(curve: Any, n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return o.astype(np.float32).astype(np.float64), d
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize("name", SOME)
 def test_rays_end_as_without_cells(name: str, precision: Precision) -> None:

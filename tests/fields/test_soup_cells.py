@@ -69,6 +69,7 @@ MESHES = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", MESHES)
 def test_samples_are_within_their_errors(
@@ -165,6 +166,7 @@ def heaps() -> tuple[np.ndarray, np.ndarray]:
     return rounded(np.concatenate([AROUND, ends])), rounded(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangles", "points"])
 def test_rounding_of_positions_counts_where_all_is_far(kind: str) -> None:
     """Errors were up to three times as large as was said, in single precision."""
@@ -198,6 +200,7 @@ def test_triangles_of_no_area_count_for_their_edges() -> None:
     np.testing.assert_allclose(sources[1, 3:7], [0, 0, 0.5, 0.5])
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("by", [0.01, 1e-4])
 def test_first_hits(by: float, precision: Any) -> None:
@@ -223,6 +226,7 @@ def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hit
     return hits
 
 
+@pytest.mark.slow
 def test_rays_from_inside_far_away_and_along_faces_of_cells() -> None:
     mesh, rng = torn(2, 0.01), np.random.default_rng(1)
     o, d = rng.uniform(-0.6, 0.6, (1000, 3)), unit(rng.normal(size=(1000, 3)))
@@ -240,6 +244,7 @@ def test_rays_from_inside_far_away_and_along_faces_of_cells() -> None:
     assert hits.is_hit.mean() > 0.3
 
 
+@pytest.mark.slow
 def test_many_rays_and_crossings() -> None:
     mesh = torn(2, 0.01)
     hits = compare(mesh, *rays(mesh, 6000, 9))  # so many that a grid of empty cells is made
@@ -265,6 +270,7 @@ def test_moved_soups_have_cells_of_their_own() -> None:
     assert (hits.is_hit == plain.is_hit).mean() > 0.998
 
 
+@pytest.mark.slow
 def test_when_there_are_cells_of_triangles() -> None:
     mesh = torn(3, 0.01)
     field = hk.WindingNumber(*mesh)

@@ -89,6 +89,7 @@ def compare(mesh: Mesh, o: np.ndarray, d: np.ndarray, **settings: Any) -> hk.Hit
     return hits
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("level", [1.5, -0.5, 0.3, 1.0, (0.5, 1.4)])
 def test_other_levels_of_overlapping_parts(level: Any) -> None:
     """Where w goes from -1 to 3: a copy inside, one turned around, one twice."""
@@ -125,6 +126,7 @@ def test_many_rays_end_as_without_cells() -> None:
     assert hits.evaluations.mean() < 4
 
 
+@pytest.mark.slow
 def test_a_rung_within_the_tolerance_is_no_hit() -> None:
     """Beside the cracks of a soup w is so steep that the tolerance holds more than its way to the
     next level, modulo one: rays hit where w was -1/2."""
@@ -150,6 +152,7 @@ def test_a_rung_within_the_tolerance_is_no_hit() -> None:
     assert not late.any()
 
 
+@pytest.mark.slow
 def test_crossings_are_those_without_cells() -> None:
     mesh = damaged("holes", 1)
     o, d = rays(mesh, 300, 2)

@@ -87,6 +87,7 @@ def test_the_kernel_of_a_page_finds_what_its_rays_say(name: str, tmp_path: Path)
     assert np.quantile(off, 0.9) <= 0.1 * surface["tolerance"] + 1e-5
 
 
+@pytest.mark.slow
 def test_a_page_of_a_mesh_of_fifty_thousand_faces_is_small(tmp_path: Path) -> None:
     vertices, faces = torus_mesh(1.0, 0.4, 250, 100)
     vertices += 0.002 * np.random.default_rng(0).normal(size=vertices.shape)
@@ -96,6 +97,7 @@ def test_a_page_of_a_mesh_of_fifty_thousand_faces_is_small(tmp_path: Path) -> No
     assert path.stat().st_size < 6e6
 
 
+@pytest.mark.slow
 def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
     hk.page(
@@ -132,6 +134,7 @@ def test_the_places_of_sliders_are_in_the_page(tmp_path: Path) -> None:
     assert np.quantile(off, 0.9) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_page_holds_fewer_places_where_they_are_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -150,6 +153,7 @@ def test_a_page_holds_fewer_places_where_they_are_large(
     assert "step" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_kernel_that_is_not_the_first_one_brings_rays_to_check(tmp_path: Path) -> None:
     path = tmp_path / "a.html"
 

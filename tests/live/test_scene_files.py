@@ -76,6 +76,7 @@ def test_how_curves_are_traced_comes_back() -> None:
             parse_scene(json.dumps(given))
 
 
+@pytest.mark.slow
 def test_every_scene_of_the_gallery_comes_back() -> None:
     for name, scene in SCENES.items():
         surfaces = scene.surfaces()
@@ -319,6 +320,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_every_command_reads_a_scene_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -44,6 +44,7 @@ def test_nothing_is_changed_where_there_is_nothing_in_common() -> None:
     assert factor_common_operands(other_level, 0.0) is None
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("hole", [ROD, NEAR, BALL & NEAR])
 def test_what_is_added_and_cut_away_again_is_not_made(hole: hk.solids.Solid) -> None:
     """Triangles of the rod passed through others, which was refused, or left a crumb."""

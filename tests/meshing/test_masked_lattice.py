@@ -97,6 +97,7 @@ PARTS = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", PARTS)
 def test_parts_made_where_they_matter_are_the_same(
     name: str, monkeypatch: pytest.MonkeyPatch

@@ -111,6 +111,7 @@ def test_thickness_is_that_of_plates_balls_and_wedges() -> None:
     assert found.values[side] == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("degrees", [20.0, 45.0, 60.0, 80.0])
 def test_thin_places_at_acute_edges_are_told_from_thin_walls(degrees: float) -> None:
     """A rim where walls meet at a slant was named as the thinnest wall, without a word."""
