@@ -190,7 +190,7 @@ def run_line(environment: Environment, line: str) -> None:
         TrialError: it failed, or wrote no file.
     """
     start = time.monotonic()
-    command = shlex.split(line)
+    command = shlex.split(line, comments=True)
     if command[1] == "view":
         try_view(environment, command)
     else:
