@@ -209,7 +209,12 @@ ONE = np.ones((4, 1))
         # CloudCompare
         ("a.txt", lines(X, RGB, N, head="//X,Y,Z,R,G,B,Nx,Ny,Nz\n"), N,
          "; colors not used"),
+        ("a.txt", lines(X, RGB, N, head="//X Y Z R G B Nx Ny Nz\n4\n"), N, "; colors not used"),
+        ("a.txt", lines(X, RGB, N), N, "; columns 4 to 6 are colors, not used"),
+        ("a.txt", lines(X, RGB, 3 * N), None, "; columns 4 to 6 are colors, not used"),
         ("a.xyz", lines(X, N, head="// scanned\n"), N, ""),
+        # Open3D
+        ("a.xyzn", lines(X, N), N, ""),
         ("a.xyz", lines(X, RGB), None, "; columns 4 to 6 are colors, not used"),
         # Leica
         ("a.pts", lines(X, -900 * ONE, RGB, head="4\n"), None, "; columns 4 and up not used"),

@@ -216,7 +216,8 @@ _READ_AS = ("winding", "dipole", "loops", "polygons")
 _READERS: dict[str, Callable[[Path, bytes], FileGeometry]] = {
     ".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".off": read_off,
     ".glb": read_gltf, ".gltf": read_gltf, ".3mf": read_3mf, ".xyz": read_point_table,
-    ".txt": read_point_table, ".csv": read_point_table, ".pts": read_point_table,
+    ".xyzn": read_point_table, ".txt": read_point_table, ".csv": read_point_table,
+    ".pts": read_point_table,
     ".pcd": read_pcd, ".las": read_las, ".laz": read_las, ".e57": read_e57,
 }  # fmt: skip
 _LOOP_FILES = (".obj", ".ply", ".loops")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harnack.backend import FloatArray
+from harnack.backend import FloatArray, IntArray
 from harnack.files.file_geometry import FileGeometry, FileLocation, FileLocations
 from harnack.files.point_fields import find_normals, find_positions, unused_notes
 from harnack.files.text_tables import TextLines, excerpt, read_floats, split_content_lines
@@ -23,13 +23,14 @@ _SLASHES = b"//"
 
 
 def read_point_table(path: Path, data: bytes) -> FileGeometry:
-    """Read the points of a .xyz, .txt, .csv or .pts file, with their normals if the table has them.
+    """Read the points of a .xyz, .xyzn, .txt, .csv or .pts file, and normals if it has them.
 
     `#` and, at the beginning of a line, `//` begin a comment. A first line of words, also behind
     `//`, names the columns: x, y and z, and nx, ny and nz or other names of normals
     (`point_fields`). Without it, columns 4 to 6 are normals if there are six columns or more; of a
     .pts file, only if all of them have the length 1. If they are integers from 0 to 255, they are
-    colors. The first line of a .pts file is the number of its points. Other columns are ignored.
+    colors, and columns 7 to 9 are normals if all have the length 1. A first line of one integer,
+    which .pts files and some others have, is the number of points. Other columns are ignored.
 
     Raises:
         FileFormatError: lines have different numbers of columns, or fewer than three; a word is not
@@ -46,9 +47,11 @@ def read_point_table(path: Path, data: bytes) -> FileGeometry:
     if names is None and len(lines) and (names := _column_names(lines.text[0])):
         lines = lines[1:]
     is_pts = path.suffix.lower() == ".pts"
-    if is_pts and len(lines) and lines.text[0].isdigit():
-        count, lines = int(lines.text[0][:18]), lines[1:]
-        if len(lines) != count:
+    if len(lines) and lines.text[0].isdigit():
+        count = int(lines.text[0][:18])
+        if is_pts or count == len(lines) - 1:
+            lines = lines[1:]
+        if is_pts and len(lines) != count:
             raise FileLocation(path).error(
                 f"its first line promises {count:,} points, but {len(lines):,} lines follow"
             )
@@ -162,19 +165,27 @@ def _by_order(path: Path, table: FloatArray, places: FileLocations, is_pts: bool
     positions, following = table[:, :3], table[:, 3:6]
     if following.shape[1] < 3:
         return FileGeometry(path, positions)
-    lengths = np.linalg.norm(following, axis=1)
-    # Normals with few digits are not exactly of unit length.
-    wrong = np.flatnonzero(np.abs(lengths - 1.0) > 0.1)
+    wrong = _rows_without_normals(following)
     if not wrong.size:
         return FileGeometry(path, positions, following)
     is_color = (following == np.rint(following)) & (following >= 0) & (following <= 255)
     # Integers up to 1 could be normals along an axis, one of which has the length 0.
     if is_color.all() and following.max() > 1:
-        return FileGeometry(path, positions, notes=("columns 4 to 6 are colors, not used",))
+        notes = ("columns 4 to 6 are colors, not used",)
+        last = table[:, 6:9]
+        has_normals = last.shape[1] == 3 and not _rows_without_normals(last).size
+        return FileGeometry(path, positions, last if has_normals else None, notes=notes)
     if is_pts:
         return FileGeometry(path, positions, notes=("columns 4 and up not used",))
+    length = np.linalg.norm(following[wrong[0]])
     raise places[wrong[0]].error(
-        f"columns 4 to 6 should be a unit normal, but their length is {lengths[wrong[0]]:.3g}: "
-        "remove these columns if they are something else, or name all columns in a first line, "
+        f"columns 4 to 6 should be a unit normal, but their length is {length:.3g}: remove "
+        "these columns if they are something else, or name all columns in a first line, "
         "x y z and others"
     )
+
+
+def _rows_without_normals(columns: FloatArray) -> IntArray:
+    """Return the rows of three columns (n, 3) that are no unit normals. Normals with few digits are
+    not exactly of unit length."""
+    return np.flatnonzero(np.abs(np.linalg.norm(columns, axis=1) - 1.0) > 0.1)
