@@ -165,6 +165,10 @@ def write_mesh(
         OSError: the file cannot be written there.
     """
     vertex_colors, face_colors = _colors_of(mesh)
+    if not len(mesh.faces):
+        raise ValueError("the mesh has no faces: there is nothing to write")
+    if not np.isfinite(np.asarray(mesh.vertices, np.float64)).all():
+        raise ValueError("the mesh has coordinates that are not finite: it cannot be written")
     has_colors = vertex_colors is not None or face_colors is not None
     is_asked = normals is not None and normals is not False
     target = check_mesh_path(path, unit=unit, normals=is_asked, colors=has_colors)
@@ -248,13 +252,35 @@ def _colors_of(mesh: trimesh.Trimesh) -> tuple[Colors | None, Colors | None]:
         raise TypeError(f"a trimesh.Trimesh is written, not {type(mesh).__name__}{hint}")
     visual: Any = mesh.visual
     if visual.kind == "texture":
-        warnings.warn("the texture is written as colors of vertices", stacklevel=3)
-        visual = visual.to_color()
+        return _material_colors(visual, len(mesh.vertices)), None
     if visual.kind == "vertex":
         return np.asarray(visual.vertex_colors, np.uint8).reshape(-1, 4), None
     if visual.kind == "face":
         return None, np.asarray(visual.face_colors, np.uint8).reshape(-1, 4)
     return None, None
+
+
+def _material_colors(visual: Any, count: int) -> Colors | None:
+    """Return the colors of the vertices (count, 4) of a mesh with a material: those of its texture,
+    with a warning, or its one color; None if it has neither.
+
+    visual: a `TextureVisuals` of trimesh. By the glTF standard the base color of a material is a
+        factor of its texture.
+    """
+    material = visual.material
+    is_pbr = hasattr(material, "baseColorFactor")
+    image = material.baseColorTexture if is_pbr else material.image
+    factor = material.baseColorFactor if is_pbr else None
+    if visual.uv is not None and image is not None:
+        warnings.warn("the texture is written as colors of vertices", stacklevel=4)
+        colors = np.asarray(visual.to_color().vertex_colors, np.float64).reshape(-1, 4)
+        colors *= 1.0 if factor is None else np.asarray(material.main_color) / 255.0
+        return np.rint(colors).astype(np.uint8)
+    # The color of a simple material that was not set is that of trimesh's default.
+    has_color = factor is not None if is_pbr else (material != type(material)())
+    if not has_color:
+        return None
+    return np.tile(np.asarray(material.main_color, np.uint8), (count, 1))
 
 
 def _given_normals(normals: bool | npt.ArrayLike | None, count: int) -> FloatArray | None:

@@ -17,6 +17,8 @@ from harnack.cli import main
 from harnack.files.geometry_files import LoadedMesh, read_geometry
 from harnack.geometry.boundary_edges import singular_edges, weld_vertices
 from harnack.io import write_mesh
+from harnack.mesh_to_file import _colors_of  # pyright: ignore[reportPrivateUsage]
+from harnack.meshing import MeshingError
 
 # A part that is not symmetric, so that axes cannot be confused.
 _BOX = trimesh.creation.box((1.0, 2.0, 3.0))
@@ -352,6 +354,31 @@ def test_the_color_of_a_texture_is_written_at_vertices(tmp_path: Path) -> None:
     read = meshio_of(tmp_path / "a.ply")
     assert set(read.point_data["red"].astype(np.uint8)) == {255}
     assert set(read.point_data["green"].astype(np.uint8)) == {128}
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj", "a.glb", "a.3mf"])
+def test_the_color_of_a_material_is_that_of_all_vertices(tmp_path: Path, name: str) -> None:
+    kind = trimesh.visual.material.PBRMaterial  # pyright: ignore
+    material = kind(baseColorFactor=[255, 128, 0, 255])
+    visual = trimesh.visual.TextureVisuals(material=material)
+    mesh = trimesh.Trimesh(_BOX.vertices, _BOX.faces, visual=visual, process=False)
+    colors, _ = _colors_of(mesh)
+    assert colors is not None
+    assert colors.tolist() == [[255, 128, 0, 255]] * 8
+    write_mesh(mesh, tmp_path / name)
+    assert (tmp_path / name).stat().st_size > 100
+
+
+def test_open_meshes_too_far_away_for_single_precision_are_refused(tmp_path: Path) -> None:
+    far = trimesh.Trimesh(
+        _BOX.vertices + np.array((4.2e6, 5.1e6, 0.0)), _BOX.faces[:-1], process=False
+    )
+    with pytest.raises(MeshingError, match=r"move it to the origin"):
+        write_mesh(far, tmp_path / "a.ply")
+    huge = trimesh.Trimesh(_BOX.vertices * 1e39, _BOX.faces[:-1], process=False)
+    with pytest.raises(MeshingError, match=r"up to 6.9e\+10"):
+        write_mesh(huge, tmp_path / "a.glb")
+    assert not list(tmp_path.iterdir())
 
 
 # What is refused, and what is left as it was.

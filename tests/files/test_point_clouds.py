@@ -213,6 +213,13 @@ ONE = np.ones((4, 1))
         ("a.txt", lines(X, RGB, N), N, "; columns 4 to 6 are colors, not used"),
         ("a.txt", lines(X, RGB, 3 * N), None, "; columns 4 to 6 are colors, not used"),
         ("a.xyz", lines(X, N, head="// scanned\n"), N, ""),
+        # NumPy
+        ("a.txt", lines(N, X, head="# nx ny nz x y z\n"), N, ""),
+        ("a.txt", lines(ONE, X, head="# made by hand\n# id x y z\n"), None, ""),
+        ("a.txt", lines(X, N, head="# x y z and normals\n"), N, ""),
+        # Other columns that are called alike
+        ("a.csv", lines(X, ONE, separator=",", head="x,y,z,Z\n"), None, ""),
+        ("a.txt", lines(X, N, ONE, head="x y z nx ny nz scalar_Nz\n"), N, ""),
         # Open3D
         ("a.xyzn", lines(X, N), N, ""),
         ("a.xyz", lines(X, RGB), None, "; columns 4 to 6 are colors, not used"),

@@ -3,7 +3,7 @@ normal, and which its color."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 __all__ = ["find_normals", "find_positions", "unused_notes"]
 
@@ -20,8 +20,9 @@ def _plain(name: str) -> str:
 
 def find_normals(names: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the names, among those of the numbers of a point, of the three components of its
-    normal; None if one is missing."""
-    by_plain_name = {_plain(name): name for name in names}
+    normal; None if one is missing. Of names that mean the same, such as `nx` and `scalar_Nx`, that
+    which is written plainly counts, else the first."""
+    by_plain_name = _by_meaning(names, _plain)
     for x, y, z in _NORMALS:
         if x in by_plain_name and y in by_plain_name and z in by_plain_name:
             return by_plain_name[x], by_plain_name[y], by_plain_name[z]
@@ -30,11 +31,22 @@ def find_normals(names: Iterable[str]) -> tuple[str, str, str] | None:
 
 def find_positions(names: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the names, among those of the numbers of a point, of its coordinates x, y and z, in
-    small or capital letters; None if one is missing."""
-    by_small_name = {name.lower(): name for name in names}
+    small or capital letters; None if one is missing. Of `x` and `X` the small one counts."""
+    by_small_name = _by_meaning(names, str.lower)
     if not all(axis in by_small_name for axis in "xyz"):
         return None
     return by_small_name["x"], by_small_name["y"], by_small_name["z"]
+
+
+def _by_meaning(names: Iterable[str], meaning: Callable[[str], str]) -> dict[str, str]:
+    """Return the names by what they mean: of several with one meaning, the name that equals it or,
+    if there is none, the first."""
+    result: dict[str, str] = {}
+    for name in names:
+        key = meaning(name)
+        if key == name or key not in result:
+            result[key] = name
+    return result
 
 
 def unused_notes(names: Iterable[str]) -> tuple[str, ...]:

@@ -26,11 +26,12 @@ def read_point_table(path: Path, data: bytes) -> FileGeometry:
     """Read the points of a .xyz, .xyzn, .txt, .csv or .pts file, and normals if it has them.
 
     `#` and, at the beginning of a line, `//` begin a comment. A first line of words, also behind
-    `//`, names the columns: x, y and z, and nx, ny and nz or other names of normals
-    (`point_fields`). Without it, columns 4 to 6 are normals if there are six columns or more; of a
-    .pts file, only if all of them have the length 1. If they are integers from 0 to 255, they are
-    colors, and columns 7 to 9 are normals if all have the length 1. A first line of one integer,
-    which .pts files and some others have, is the number of points. Other columns are ignored.
+    `//` or, if it has a word for each column, behind `#`, names the columns: x, y and z, and nx, ny
+    and nz or other names of normals (`point_fields`). Without it, columns 4 to 6 are normals if
+    there are six columns or more; of a .pts file, only if all of them have the length 1. If they
+    are integers from 0 to 255, they are colors, and columns 7 to 9 are normals if all have the
+    length 1. A first line of one integer, which .pts files and some others have, is the number of
+    points. Other columns are ignored.
 
     Raises:
         FileFormatError: lines have different numbers of columns, or fewer than three; a word is not
@@ -58,9 +59,26 @@ def read_point_table(path: Path, data: bytes) -> FileGeometry:
     if not len(lines):
         raise FileLocation(path).error("it holds no points: write one a line, x y z")
     table = _read_rectangle(lines)
+    if names is None:
+        names = _names_in_comments(data, table.shape[1])
     if names is not None:
         return _by_names(path, table, names)
     return _by_order(path, table, lines.locations, is_pts)
+
+
+def _names_in_comments(data: bytes, count: int) -> list[str] | None:
+    """Return the names of `count` columns that the last comment before the first point lists, as
+    `numpy.savetxt` writes them behind `#`; None if it lists no x, y and z, or other names."""
+    names: list[str] | None = None
+    for line in data.removeprefix(b"\xef\xbb\xbf").splitlines():
+        line = line.strip()
+        if line and not line.startswith(b"#"):
+            break
+        if line:
+            names = _column_names(line.lstrip(b"# "))
+    if names is None or len(names) != count or find_positions(names) is None:
+        return None
+    return names
 
 
 def _without_slashes(lines: TextLines) -> TextLines:

@@ -93,6 +93,7 @@ class ClosedMesh(trimesh.Trimesh):
         if self.units is not None:
             written.units = self.units
         if not self.is_watertight:
+            _check_precision(np.asarray(self.vertices, np.float64))
             return written, None
         grid_spacing = _grid_spacing(np.asarray(self.vertices, np.float64))
         return _quantize(written, grid_spacing), max(1, round(-math.log2(grid_spacing)))
@@ -106,9 +107,21 @@ def _grid_spacing(x: FloatArray) -> float:
     Raises:
         MeshingError: the grid is too coarse for the size of the mesh, or coordinates are too large.
     """
-    largest, size = float(np.abs(x).max()), float(np.ptp(x, axis=0).max())
+    return _check_precision(x, _MIN_STEP)
+
+
+def _check_precision(x: FloatArray, min_step: float = 0.0) -> float:
+    """The spacing of single precision at the largest coordinate of vertices x (n, 3), a power of
+    two, or `min_step` if that is larger.
+
+    Raises:
+        MeshingError: the spacing is too coarse for the size of the mesh, or coordinates are too
+            large for files.
+    """
+    largest = float(np.abs(x).max(initial=0.0))
+    size = float(np.ptp(x, axis=0).max()) if len(x) else 0.0
     # (`frexp` gives the exponent second.)
-    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), _MIN_STEP)
+    step = max(math.ldexp(1.0, math.frexp(largest)[1] - 24), min_step)
     # `not <=` also refuses coordinates that are not numbers.
     if size < _MIN_STEPS_ACROSS * step or not largest <= _LARGEST:
         raise MeshingError(
