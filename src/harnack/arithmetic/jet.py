@@ -122,14 +122,13 @@ class Jet(FormulaNumber):
             return self._constant(Interval.point(x))
         return self._constant(Interval.enclosing(float(x), type(self.backend_number())))
 
+    def constant_between(self, lower: Real, upper: Real) -> Jet:
+        return self._constant(Interval(lower, upper))
+
     def _constant(self, value: Interval) -> Jet:
         """A constant that lies in the interval `value`, as a function of the same variables."""
         zeros = (ZERO,) * len(self.first_derivatives), (ZERO,) * len(self.second_derivatives)
-        start = (
-            None
-            if self.jet_at_start is None
-            else Jet(value, *zeros, piece_length=self.jet_at_start.piece_length)
-        )
+        start = None if self.jet_at_start is None else self.jet_at_start._constant(value)
         return Jet(value, *zeros, start, self.piece_length)
 
     def backend_number(self) -> Any:
@@ -531,6 +530,10 @@ class Dual(FormulaNumber):
 
     def constant(self, x: float | Real) -> Dual:
         return Dual(cast("Any", type(self.value))(x), (0.0, 0.0, 0.0))
+
+    def constant_between(self, lower: Real, upper: Real) -> Dual:
+        del upper  # nothing is proved with dual numbers
+        return self.constant(lower)
 
     def sum(self, other: Dual) -> Dual:
         """The sum of this function and another one."""

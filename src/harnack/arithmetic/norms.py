@@ -45,6 +45,9 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     """
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
+    whole = _as_one_operation(name, values)
+    if whole is not None:
+        return whole
     if any(isinstance(value, FormulaNumber) for value in values):
         # Jets and their like first: their methods accept numbers of the other kinds.
         ordered = sorted(values, key=lambda value: not isinstance(value, FormulaNumber))
@@ -57,6 +60,13 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
         return array_function(a, b) if is_array else plain_function(a, b)
 
     return functools.reduce(plain, values)
+
+
+def _as_one_operation(name: str, values: tuple[Any, ...], *literals: float) -> Any:
+    """A function of several numbers as a single operation of their arithmetic
+    (`FormulaNumber.of_several`); None if they have none."""
+    number = next((value for value in values if isinstance(value, FormulaNumber)), None)
+    return None if number is None else number.of_several(name, values, *literals)
 
 
 _EXTREMUM_FUNCTIONS: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], Any]]] = {
@@ -95,6 +105,9 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         return sizes[0] if len(sizes) == 1 else maximum(*sizes)
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(term) for term in values])
+    whole = _as_one_operation("norm", values, p)
+    if whole is not None:
+        return whole
     jets = [term for term in values if isinstance(term, Jet)]
     # Another arithmetic than jets: the root of the sum of powers.
     if not jets and any(isinstance(term, FormulaNumber) for term in values):
@@ -321,6 +334,9 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     radii, as in Hart's paper, the function is not continuous at g = 0, and there is no constant at
     all.
     """
+    whole = _as_one_operation("blended union", (a, b, radius), power)
+    if whole is not None:
+        return whole
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
     smaller = minimum(a, b)
@@ -342,7 +358,8 @@ def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     radius: the blend changes the intersection where both -a and -b are less than this.
     power: at least 1; larger powers make the edge sharper (`blend_union`).
     """
-    return -blend_union(-a, -b, radius, power)
+    whole = _as_one_operation("blended intersection", (a, b, radius), power)
+    return -blend_union(-a, -b, radius, power) if whole is None else whole
 
 
 def orthogonal_intersection(*sides: Any) -> Any:
@@ -356,6 +373,9 @@ def orthogonal_intersection(*sides: Any) -> Any:
     is positive, it is that one, the largest. Inside, the largest of the functions is minus the
     distance to the nearest boundary.
     """
+    whole = _as_one_operation("orthogonal intersection", sides)
+    if whole is not None:
+        return whole
     largest = maximum(*sides)
     outside = norm(*(maximum(side, 0.0) for side in sides))
     distance = outside + minimum(largest, 0.0)

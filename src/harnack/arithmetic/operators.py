@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -100,6 +100,29 @@ class FormulaNumber(abc.ABC):
         """The p-norm (|x|^p + |y|^p + ...)^(1/p) of some numbers, where this number is the sum
         |x|^p + |y|^p + ... that is already computed."""
         return self.apply(sqrt if p == 2.0 else power(1 / p))
+
+    def of_several(self, name: str, values: Sequence[Any], *literals: float) -> Self | None:
+        """A function of several numbers, as a single operation of this arithmetic; None, the
+        default, if it is to be computed from operations of one and two numbers.
+
+        name: "maximum", "minimum", "norm", "orthogonal intersection", "blended union" or "blended
+            intersection".
+        values: the numbers, of any kind, at least one of them of this arithmetic.
+        literals: the p of a norm, the power of a blend.
+        """
+        del name, values, literals
+        return None
+
+    def constant_between(self, lower: Real, upper: Real) -> Self:
+        """A constant that lies between two numbers of the backend.
+
+        Raises:
+            TypeError: this arithmetic has no such constants, as this default.
+        """
+        del lower, upper
+        raise TypeError(
+            f"{type(self).__name__} has no constants that are ranges, as long formulas need them"
+        )
 
     def _coerce_or_none(self, other: Any) -> Self | None:
         """The operand `other` as a number of this arithmetic: `other` itself if it is one already,

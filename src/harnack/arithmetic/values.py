@@ -90,6 +90,10 @@ class Values(FormulaNumber):
             is_never,
         )
 
+    def constant_between(self, lower: Real, upper: Real) -> Values:
+        is_never = self.nowhere & ~self.nowhere
+        return Values(Interval(lower, upper), is_never, is_never, is_never)
+
     def sum(self, other: Values) -> Values:
         """The sum of this function and another one."""
         return self._with(self.value + other.value, other)

@@ -131,8 +131,13 @@ class Formula(Field):
         return self.tally.may_jump
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
-        """The evaluator of the formula, with its numbers as kernel parameters of the backend."""
-        del plan
+        """The evaluator of the formula, with its numbers as kernel parameters of the backend; for a
+        long formula, one that interprets it."""
+        from harnack.fields.tape_evaluator import tape_evaluator
+
+        by_tape = tape_evaluator(self, backend, plan)
+        if by_tape is not None:
+            return by_tape
         numbers = with_device_numbers(self, backend)
         return FormulaEvaluator(self, numbers.formula, numbers.lipschitz)
 
@@ -178,6 +183,16 @@ class FormulaEvaluator(Evaluator):
     def may_jump(self) -> bool:
         """Whether f may jump, by what the field knows of the formula."""
         return self.field.may_jump
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether f is known to be convex."""
+        return self.field.is_convex
+
+    @property
+    def max_radius(self) -> Real:
+        """The largest radius of a ball within which a Lipschitz constant is computed."""
+        return _MAX_RADIUS
 
     @property
     def is_steep(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -267,9 +282,9 @@ class FormulaEvaluator(Evaluator):
     def sample_without_alternatives(self, p: Vec3) -> Sample:
         """The sample at p with the proved bounds of `promises` only. Samples on rays use no
         others."""
-        return self._sample_of(self._jet(Jet.at_point(p)), p)
+        return self.sample_of_jet(self._jet(Jet.at_point(p)), p)
 
-    def _sample_of(self, jet: Jet, p: Vec3) -> Sample:
+    def sample_of_jet(self, jet: Jet, p: Vec3) -> Sample:
         """The sample at p, made from `jet`, the jet of f at p. Value and gradient are the midpoints
         of the ranges in it; their errors are half the widths of the ranges."""
         # Adding it turns a Python number into a Dr.Jit array.
@@ -295,7 +310,7 @@ class FormulaEvaluator(Evaluator):
         newton_length = dr.abs(sample.value) / safe_norm(sample.gradient)
         promises: list[Lipschitz] = []
         for multiple in _RADII:
-            radius = fmin(multiple * newton_length, _MAX_RADIUS)
+            radius = fmin(multiple * newton_length, self.max_radius)
             jet = self._jet(Jet.over_ball(p, radius))
             slopes = (0 * p.x + derivative.max_abs for derivative in jet.first_derivatives)
             # A bound of the length of the gradient, from bounds of its components, and enlarged for
@@ -358,7 +373,7 @@ class FormulaEvaluator(Evaluator):
         del back
         p = path.point(t)
         jet = self._jet(Jet.at_point(p))
-        sample = self._sample_of(jet, p)
+        sample = self.sample_of_jet(jet, p)
         slope, slope_error = self._slope(p, path.direction)
         slopes = SlopeRange.around(slope, slope_error)
         function = self.restrict(p, path.direction)
@@ -383,7 +398,7 @@ class FormulaEvaluator(Evaluator):
         # from the kinds that examine a given length, before the one is added that holds on all
         # lengths.
         growth = max(entry.reach_growth for entry in enclosures)
-        if self.field.is_convex and ConvexityEnclosure in path.proofs.kinds:
+        if self.is_convex and ConvexityEnclosure in path.proofs.kinds:
             enclosures = (*enclosures, ConvexityEnclosure(slopes))
         # A lower bound of |grad f|, from lower bounds of its components. (0 * p.x turns Python
         # numbers into Dr.Jit arrays.)

@@ -40,6 +40,7 @@ from harnack.fields.solids.solid import (
     not_a_solid,
     without_levels,
 )
+from harnack.fields.tape_evaluator import tape_evaluator
 from harnack.geometry import Box, VolumeIntersection
 
 if TYPE_CHECKING:
@@ -171,7 +172,10 @@ class BooleanSolid(Solid):
             [own_formula(part)(x, y, z) for part in self.parts], is_union=self.is_union
         )
 
-    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> BooleanSolidEvaluator:
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        by_tape = tape_evaluator(self, backend, plan)
+        if by_tape is not None:
+            return by_tape
         parts = tuple(part.evaluator(backend, plan) for part in self.parts)
         return BooleanSolidEvaluator(parts, self.is_union)
 

@@ -1,0 +1,360 @@
+"""Recording of formulas as tapes. A formula is a Python function of the coordinates; evaluated with
+`TapeNumber`s in place of numbers it records its operations, and the result is a `Tape`: a list of
+instructions, each with an operation, operands (earlier instructions) and constants."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.arithmetic.functions import exp, log, power, sqrt
+from harnack.arithmetic.operators import FormulaNumber, exponent_of
+from harnack.backend import FloatArray, IntArray
+from harnack.tape.operations import (
+    COORDINATE_COUNT,
+    MAX_CONSTANTS,
+    Operation,
+    blend_operation,
+    function_operation,
+    norm_operation,
+    operation_named,
+)
+
+if TYPE_CHECKING:
+    from harnack.arithmetic.functions import ElementaryFunction
+
+__all__ = ["Tape", "TapeNumber", "record"]
+
+_MAX_OPERANDS = 3
+# A number that is recorded is a sum of at most this many multiples of results of instructions.
+_MAX_TERMS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Tape:
+    """A formula as a list of n instructions. The first three are the coordinates x, y and z.
+
+    operations: the operations that occur, each once.
+    kinds: (n,) for each instruction the index of its operation; -1 for coordinates.
+    operands: (n, 3) the instructions that are its operands, all before it; -1 for none.
+    constants: (n, 4) its constants, 0 where there are fewer.
+    result: the instruction whose result is the value of the formula.
+    """
+
+    operations: tuple[Operation, ...]
+    kinds: IntArray
+    operands: IntArray
+    constants: FloatArray
+    result: int
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    @functools.cached_property
+    def constant_columns(self) -> FloatArray:
+        """The constants as an array (4, n)."""
+        return np.ascontiguousarray(self.constants.T)
+
+    @functools.cached_property
+    def depths(self) -> IntArray:
+        """For each instruction (n,) the length of the longest chain of operands below it."""
+        depths = [0] * len(self)
+        for k, operands in enumerate(self.operands.tolist()):
+            depths[k] = 1 + max((depths[j] for j in operands if j >= 0), default=-1)
+        return np.array(depths, np.int64)
+
+
+@dataclass(eq=False)
+class _Recorder:
+    """Instructions in the order in which they were recorded. Equal instructions are recorded
+    once."""
+
+    operations: list[Operation] = field(default_factory=list[Operation])
+    rows: list[tuple[int, tuple[int, ...], tuple[float, ...]]] = field(
+        default_factory=lambda: [(-1, (), ())] * COORDINATE_COUNT
+    )
+    kind_of: dict[str, int] = field(default_factory=dict[str, int])
+    index_of: dict[Any, int] = field(default_factory=dict[Any, int])
+
+    def add(
+        self, operation: Operation, operands: tuple[int, ...], constants: tuple[float, ...] = ()
+    ) -> int:
+        """Add an instruction, and return its index."""
+        key = operation.name, operands, constants
+        index = self.index_of.get(key)
+        if index is None:
+            kind = self.kind_of.get(operation.name)
+            if kind is None:
+                kind = self.kind_of[operation.name] = len(self.operations)
+                self.operations.append(operation)
+            index = self.index_of[key] = len(self.rows)
+            self.rows.append((kind, operands, constants))
+        return index
+
+    def tape(self, result: int) -> Tape:
+        """The tape of the instructions that the result depends on. Each comes after its operands,
+        and the operand with the longest chain below it comes first, so that few results have to be
+        kept at a time."""
+        depths = [0] * len(self.rows)
+        for k, (_, operands, _) in enumerate(self.rows):
+            depths[k] = 1 + max((depths[j] for j in operands), default=-1)
+        new_index = {k: k for k in range(COORDINATE_COUNT)}
+        rows, stack = self.rows[:COORDINATE_COUNT], [result]
+        while stack:
+            k = stack[-1]
+            missing = [j for j in self.rows[k][1] if j not in new_index]
+            if missing:
+                stack.extend(sorted(missing, key=depths.__getitem__))
+                continue
+            stack.pop()
+            if k not in new_index:
+                new_index[k] = len(rows)
+                rows.append(self.rows[k])
+        operands = np.full((len(rows), _MAX_OPERANDS), -1, np.int64)
+        constants = np.zeros((len(rows), MAX_CONSTANTS))
+        for k, (_, row_operands, row_constants) in enumerate(rows):
+            operands[k, : len(row_operands)] = [new_index[j] for j in row_operands]
+            constants[k, : len(row_constants)] = row_constants
+        kinds = np.array([kind for kind, _, _ in rows], np.int64)
+        return Tape(tuple(self.operations), kinds, operands, constants, new_index[result])
+
+
+@dataclass(frozen=True, eq=False)
+class TapeNumber(FormulaNumber):
+    """A number of a formula that is being recorded: a constant plus up to three multiples of
+    results of instructions. Such sums become instructions when something else than a sum is
+    computed of them, so that the three products and sums of a rotated coordinate are one
+    instruction.
+
+    terms: pairs of an instruction and a factor.
+    shift: the constant.
+    roots: numbers such that this one is the sum of their squares; empty if none are known. The
+        square root of such a sum is a norm, whose slopes are bounded.
+
+    Factors and constants are combined only where this is exact in double precision: what is
+    recorded is the formula itself, not a rounded one.
+    """
+
+    recorder: _Recorder
+    terms: tuple[tuple[int, float], ...]
+    shift: float = 0.0
+    roots: tuple[TapeNumber, ...] = ()
+
+    def constant(self, x: Any) -> TapeNumber:
+        """Raises TypeError for an array of Dr.Jit, whose numbers are not known here."""
+        if dr.is_array_v(type(x)):
+            raise TypeError("a formula with arrays of Dr.Jit cannot be recorded")
+        return TapeNumber(self.recorder, (), float(x))
+
+    def _instruction(
+        self, operation: Operation, operands: Sequence[TapeNumber], constants: Sequence[float] = ()
+    ) -> TapeNumber:
+        """The result of an operation, as a new instruction."""
+        indices = tuple(operand.index for operand in operands)
+        return self._of_instruction(self.recorder.add(operation, indices, tuple(constants)))
+
+    def _of_instruction(self, index: int) -> TapeNumber:
+        """The result of an instruction."""
+        return TapeNumber(self.recorder, ((index, 1.0),))
+
+    @property
+    def is_instruction(self) -> bool:
+        """Whether this number is the result of an instruction and nothing else."""
+        return self.shift == 0.0 and len(self.terms) == 1 and self.terms[0][1] == 1.0
+
+    @property
+    def index(self) -> int:
+        """The instruction whose result is this number. It is recorded, if there is none yet."""
+        if self.is_instruction:
+            return self.terms[0][0]
+        indices = tuple(index for index, _ in self.terms)
+        factors = tuple(factor for _, factor in self.terms)
+        shift, add = self.shift, self.recorder.add
+        if not factors:
+            return add(operation_named("constant"), (), (shift,))
+        if factors == (1.0,):
+            kind, operands, constants = self.recorder.rows[indices[0]]
+            if kind >= 0 and self.recorder.operations[kind].name == "distance of point":
+                return add(operation_named("ball"), operands, (*constants, -shift))
+            return add(operation_named("shift"), indices, (shift,))
+        if shift == 0.0:
+            if factors == (-1.0,):
+                return add(operation_named("negative"), indices)
+            if len(factors) == 1:
+                return add(operation_named("scale"), indices, factors)
+            if factors == (1.0, 1.0):
+                return add(operation_named("sum"), indices)
+            if factors == (1.0, -1.0):
+                return add(operation_named("difference"), indices)
+            if factors == (-1.0, 1.0):
+                return add(operation_named("difference"), indices[::-1])
+        return add(operation_named(f"affine {len(factors)}"), indices, (*factors, shift))
+
+    @property
+    def recorded(self) -> TapeNumber:
+        """This number as the result of an instruction."""
+        return self._of_instruction(self.index)
+
+    def sum(self, other: TapeNumber) -> TapeNumber:
+        """The sum of this number and another one."""
+        a, b = self, other
+        if not _is_exact_sum(a.shift, b.shift):
+            a, b = (a.recorded, b) if a.terms else (a, b.recorded)
+            if not _is_exact_sum(a.shift, b.shift):
+                a, b = a.recorded, b.recorded
+        both = {index for index, _ in a.terms} & {index for index, _ in b.terms}
+        if both or len(a.terms) + len(b.terms) > _MAX_TERMS:
+            a, b = (entry if len(entry.terms) <= 1 and not both else entry.recorded
+                    for entry in (a, b))  # fmt: skip
+            if a.terms and b.terms and a.terms[0][0] == b.terms[0][0]:  # a number and itself
+                return a._scaled(2.0)
+        roots = self.roots + other.roots if self.roots and other.roots else ()
+        return TapeNumber(self.recorder, a.terms + b.terms, a.shift + b.shift, roots)
+
+    def __neg__(self) -> TapeNumber:
+        return self._scaled(-1.0)
+
+    def _scaled(self, factor: float) -> TapeNumber:
+        """This number times a constant."""
+        numbers = (*(entry for _, entry in self.terms), self.shift)
+        base = self if all(_is_exact_product(n, factor) for n in numbers) else self.recorded
+        terms = tuple((index, entry * factor) for index, entry in base.terms)
+        return TapeNumber(self.recorder, terms, base.shift * factor)
+
+    def product(self, other: TapeNumber) -> TapeNumber:
+        """The product of this number and another one."""
+        if other is self:
+            return self.apply(power(2))
+        if not other.terms:
+            return self._times_constant(other.shift)
+        if not self.terms:
+            return other._times_constant(self.shift)
+        a, b = self.index, other.index
+        if a == b:
+            return self.apply(power(2))
+        return self._of_instruction(self.recorder.add(operation_named("product"), (a, b)))
+
+    def _times_constant(self, factor: float) -> TapeNumber:
+        """This number times a constant. Of a constant, an instruction: the product is rounded."""
+        if not self.terms and not _is_exact_product(self.shift, factor):
+            return self.recorded._scaled(factor)
+        result = self._scaled(factor)
+        if self.roots and factor == 1.0:
+            return TapeNumber(self.recorder, result.terms, result.shift, self.roots)
+        return result
+
+    def __truediv__(self, other: Any) -> Any:
+        b = self._coerce_or_none(other)
+        if b is None:
+            return NotImplemented
+        if b.terms:
+            return self.product(b.apply(_reciprocal()))
+        if b.shift == 0.0:
+            raise ZeroDivisionError("a formula divides by the constant 0")
+        inverse = 1.0 / b.shift
+        if _is_exact_product(inverse, b.shift) and inverse * b.shift == 1.0:
+            return self._times_constant(inverse)
+        return self._instruction(operation_named("divide"), [self], [b.shift])
+
+    def __pow__(self, exponent: Any) -> TapeNumber:
+        if isinstance(exponent, TapeNumber):
+            if exponent.terms:
+                return exponent.product(self.apply(log)).apply(exp)
+            exponent = exponent.shift
+        n = exponent_of(exponent)
+        return self.apply(sqrt if n == 0.5 and self.roots else power(n))
+
+    def apply(self, function: ElementaryFunction) -> TapeNumber:
+        """An elementary function of this number. The root of a sum of squares is a norm."""
+        if function is sqrt and self.roots:
+            return self._norm(self.roots, 2.0)
+        result = self._instruction(function_operation(function), [self])
+        if function.name == "power 2":
+            return TapeNumber(self.recorder, result.terms, 0.0, (self,))
+        return result
+
+    def pointwise_maximum(self, other: TapeNumber) -> TapeNumber:
+        return self._instruction(operation_named("maximum"), [self, other])
+
+    def minimum(self, other: Any) -> TapeNumber:
+        return self._instruction(operation_named("minimum"), [self, self.coerce(other)])
+
+    def polar_angle(self, x: TapeNumber) -> TapeNumber:
+        return self._instruction(operation_named("polar angle"), [self, x])
+
+    def _norm(self, values: Sequence[TapeNumber], p: float) -> TapeNumber:
+        """The p-norm of two or more numbers. (The norm of four numbers is that of a norm and of
+        the others.)"""
+        if len(values) == 1:
+            return abs(values[0])
+        if len(values) > _MAX_OPERANDS:
+            return self._norm([self._norm(values[:_MAX_OPERANDS], p), *values[_MAX_OPERANDS:]], p)
+        is_point = p == 2.0 and len(values) == _MAX_OPERANDS
+        if is_point and all(len(v.terms) == 1 and v.terms[0][1] == 1.0 for v in values):
+            indices = tuple(value.terms[0][0] for value in values)
+            center = tuple(-value.shift for value in values)
+            of_point = " of point" if indices == tuple(range(COORDINATE_COUNT)) else ""
+            operation = operation_named("distance" + of_point)
+            return self._of_instruction(self.recorder.add(operation, indices, center))
+        return self._instruction(norm_operation(len(values), p), values)
+
+    def of_several(self, name: str, values: Sequence[Any], *literals: float) -> TapeNumber | None:
+        numbers = [self.coerce(value) for value in values]
+        if name == "norm":
+            return self._norm(numbers, *literals)
+        if name in ("maximum", "minimum"):
+            # A balanced tree: in a chain a box would decide one operand after another.
+            while len(numbers) > 1:
+                pairs = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
+                numbers = [getattr(p[0], name)(p[1]) if len(p) > 1 else p[0] for p in pairs]
+            return numbers[0]
+        if name == "orthogonal intersection":
+            count = len(numbers)
+            if not 2 <= count <= _MAX_OPERANDS:
+                return None
+            return self._instruction(operation_named(f"orthogonal {count}"), numbers)
+        # Blended unions and intersections: two numbers and the radius.
+        a, b, radius = numbers
+        if radius.terms:
+            return None
+        operation = blend_operation(literals[0], is_union=name == "blended union")
+        return self._instruction(operation, [a, b], [radius.shift])
+
+
+def _reciprocal() -> ElementaryFunction:
+    from harnack.arithmetic.functions import reciprocal
+
+    return reciprocal
+
+
+def _is_exact_sum(a: float, b: float) -> bool:
+    """Whether the sum of two numbers is not rounded."""
+    return a == 0.0 or b == 0.0 or Fraction(a) + Fraction(b) == Fraction(a + b)
+
+
+def _is_exact_product(a: float, b: float) -> bool:
+    """Whether the product of two numbers is not rounded."""
+    return abs(b) == 1.0 or abs(a) == 1.0 or Fraction(a) * Fraction(b) == Fraction(a * b)
+
+
+def record(formula: Callable[[Any, Any, Any], Any]) -> Tape:
+    """Record a formula as a tape.
+
+    formula: a function of three coordinates, which may be numbers of any arithmetic.
+
+    Raises:
+        TypeError: the formula does not accept such numbers.
+    """
+    recorder = _Recorder()
+    x, y, z = (TapeNumber(recorder, ((k, 1.0),)) for k in range(COORDINATE_COUNT))
+    try:
+        value = x.coerce(formula(x, y, z))
+    except (AttributeError, RuntimeError) as error:
+        raise TypeError(f"the formula cannot be recorded: {error}") from error
+    return recorder.tape(cast("TapeNumber", value).index)
