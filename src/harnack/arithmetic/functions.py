@@ -29,6 +29,8 @@ _POSITIVE = (0.0, math.inf)
 # No function here overflows if its exact value is below this fraction of the largest number; LLVM's
 # exp overflows from 0.7 on.
 _SAFE_FRACTION = 1 / 16
+# An interval of angles of at most this many roundings counts as a point.
+_POINT_ROUNDINGS = 64.0
 # A bound of the error of exp, log and the like on every backend, in units in the last place.
 _MAX_ULP_ERROR = 8.0
 
@@ -222,8 +224,9 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     Whether such a point is inside is tested on an interval that is wider by the rounding of the
     test; a point that is counted although it is outside is within that rounding of an end. For
     arguments beyond `max_sincos_argument` sines are not known. There the range is [-1, 1] on
-    intervals. At a single point it is all numbers: the value at a point is taken half way between
-    the ends of its range, and from [-1, 1] it would be 0, which looks like a value.
+    intervals. At a single point, and on intervals as narrow as its rounding, it is all numbers: the
+    value at a point is taken half way between the ends of its range, and from [-1, 1] it would be
+    0, which looks like a value.
     """
     epsilon, max_argument = machine_epsilon(x.lower), max_sincos_argument(type(x.lower))
     sine_lower, cosine_lower = sincos(x.lower)
@@ -244,7 +247,10 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
     turns_per_radian = 1 / (2 * math.pi)
     rounding = 8 * epsilon * (fmax(dr.abs(x.lower), dr.abs(x.upper)) + 1) * turns_per_radian
     low, high = x.lower * turns_per_radian - rounding, x.upper * turns_per_radian + rounding
-    is_unknown = ~(fmax(dr.abs(x.lower), dr.abs(x.upper)) <= max_argument) | ~(high - low < 1)
+    size = fmax(dr.abs(x.lower), dr.abs(x.upper))
+    is_unknown = ~(size <= max_argument) | ~(high - low < 1)
+    # An interval that is a point up to some roundings.
+    no_value = ~(size <= max_argument) & (x.upper - x.lower <= _POINT_ROUNDINGS * epsilon * size)
 
     def passes(phase: float) -> Mask:
         """Whether x/(2 pi), the interval in full turns, contains phase + k for an integer k."""
@@ -259,7 +265,12 @@ def _sine_and_cosine(x: Interval) -> tuple[Interval, Interval]:
         plain = Interval(fmin(a, b), fmax(a, b)).widened(4 * epsilon, 4 * epsilon)
         lowest = dr.select(passes(bottom), -1, plain.lower)
         # (On lanes of `is_unknown` the range is [-1, 1].)
-        return _clip_to_unit(Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown)
+        clipped = _clip_to_unit(
+            Interval(lowest, dr.select(passes(top), 1, plain.upper)), is_unknown
+        )
+        return Interval(
+            dr.select(no_value, -dr.inf, clipped.lower), dr.select(no_value, dr.inf, clipped.upper)
+        )
 
     return range_between(sine_lower, sine_upper, 0.25, 0.75), range_between(
         cosine_lower, cosine_upper, 0.0, 0.5

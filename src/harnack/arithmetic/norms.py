@@ -337,6 +337,10 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     whole = _as_one_operation("blended union", (a, b, radius), power)
     if whole is not None:
         return whole
+    jets = [operand for operand in (a, b) if isinstance(operand, Jet)]
+    if jets and power == 2.0:
+        a, b, r = (jets[0].coerce(number) for number in (a, b, radius))
+        return _jet_blend(a, b, r)
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
     near = (1.0 - norm(g_a, g_b, p=power)) * radius
     smaller = minimum(a, b)
@@ -348,6 +352,95 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     excess = smaller - radius
     blend = near.select(excess.value.upper < 0, blend)
     return smaller.select(excess.value.lower > 0, blend)
+
+
+def _jet_blend(a: Jet, b: Jet, radius: Jet) -> Jet:
+    """The blended union of two jets (ranges of functions a and b and of their derivatives) with a
+    circular edge of the given radius r, a constant.
+
+    Proof. With p = r - a and q = r - b let phi be |(p, q)| of their positive parts if one of them
+    is positive, and else max(p, q). The blend is F = r - phi. Over all unit vectors n with n_1, n_2
+    >= 0, phi is the largest n . (p, q): where p or q is positive by Cauchy's inequality, and else
+    at n = (1, 0) or (0, 1). So F is the least of the functions r - n . (p, q), whose derivatives
+    are n_1 a' + n_2 b' and n_1 a'' + n_2 b''. At each point F has the slope of an n at which the
+    largest is attained, and F'' is at most n_1 a'' + n_2 b'' there, kinks included.
+
+    For p > 0 or q > 0, n is (p, q)/N for the positive parts of p and q and their norm N, and by
+    Lagrange's identity
+
+        F'' = n_1 a'' + n_2 b'' - (n_1 b' - n_2 a')^2 / N
+
+    (where one of the parts is 0, as there F is a or b, and the last term is at most 0). F'' has no
+    lower bound where N may be 0. n_1 grows with p and falls with q, so that its range follows from
+    the ends of theirs. F grows with a and b, and so does the range of F.
+    """
+    number = next((f.value.lower for f in (a, b) if not f.value.is_literal), a.backend_number())
+    x, y, r = (as_backend_interval(f.value, number) for f in (a, b, radius))
+    p, q = r + -x, r + -y
+    # The least and the largest of the positive parts.
+    (p_low, p_high), (q_low, q_high) = (
+        (fmax(entry.lower, 0), _positive_or_nan(entry.upper)) for entry in (p, q)
+    )
+    n_1, n_2 = _share(p_low, p_high, q_low, q_high), _share(q_low, q_high, p_low, p_high)
+    smallest = _norm_of_magnitudes([p_low, q_low], 2.0)
+    # Where only one of the parts is positive, F is a or b, and there is no last term.
+    is_single = ((p_high <= 0) & (q_low > 0)) | ((q_high <= 0) & (p_low > 0))
+    largest = Interval.point(fmax(smallest.lower, 0)).reciprocal().upper
+    inverse = Interval(0 * number, dr.select(is_single, 0, largest))
+    first = tuple(
+        n_1 * u + n_2 * v for u, v in zip(a.first_derivatives, b.first_derivatives, strict=True)
+    )
+    bend = [
+        n_1 * v + -(n_2 * u) for u, v in zip(a.first_derivatives, b.first_derivatives, strict=True)
+    ]
+    second = tuple(
+        n_1 * a.second_derivatives[k]
+        + n_2 * b.second_derivatives[k]
+        + -((bend[i].square() if i == j else bend[i] * bend[j]) * inverse)
+        for k, (i, j) in enumerate(a.hessian_indices())
+    )
+    value = Interval(
+        _blend_of_numbers(x.lower, y.lower, r).lower, _blend_of_numbers(x.upper, y.upper, r).upper
+    )
+    jet = Jet(value, first, second, piece_length=a.piece_length)
+    starts = [f.jet_at_start for f in (a, b, radius)]
+    if any(f is None for f in starts):
+        return jet
+    return jet.narrowed_from_start(_jet_blend(*cast("list[Jet]", starts)), a.piece_length)
+
+
+def _positive_or_nan(x: Any) -> Any:
+    """The larger of x and 0; NaN if x is."""
+    return dr.select(x < 0, 0, x)
+
+
+def _share(p_low: Any, p_high: Any, q_low: Any, q_high: Any) -> Interval:
+    """The range of p/|(p, q)| for p in [p_low, p_high] and q in [q_low, q_high], numbers >= 0. If
+    both may be 0, it may be any number from 0 to 1."""
+    low = Interval.point(p_low) * _norm_of_magnitudes([p_low, q_high], 2.0).reciprocal()
+    high = Interval.point(p_high) * _norm_of_magnitudes([p_high, q_low], 2.0).reciprocal()
+    may_vanish = ~((p_low > 0) | (q_low > 0))
+    none = ~((p_high > 0) | may_vanish)  # p is 0, and q is not
+    upper = dr.select(none, 0, fmin(dr.select(may_vanish | dr.isnan(high.upper), 1, high.upper), 1))
+    lower = dr.select(may_vanish | dr.isnan(low.lower), 0, fmax(low.lower, 0))
+    return Interval(lower, upper)
+
+
+def _blend_of_numbers(a: Any, b: Any, radius: Interval) -> Interval:
+    """The blended union of two numbers, as an interval that contains it in spite of rounding."""
+    p, q = radius + Interval.point(-a), radius + Interval.point(-b)
+    low, high = (
+        _norm_of_magnitudes([fmax(getattr(entry, end), 0) for entry in (p, q)], 2.0)
+        for end in ("lower", "upper")
+    )
+    # Where both numbers are at least the radius, it is the smaller of the two.
+    smaller = fmin(a, b)
+    near = radius + -Interval(low.lower, high.upper)
+    lower = dr.select(smaller >= radius.upper, smaller, fmin(near.lower, smaller))
+    upper = dr.select(smaller >= radius.lower, fmax(smaller, near.upper), near.upper)
+    # An end that is NaN stands for an infinite one.
+    is_unknown = dr.isnan(a + b)
+    return Interval(dr.select(is_unknown, -dr.inf, lower), dr.select(is_unknown, dr.inf, upper))
 
 
 def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:

@@ -13,16 +13,20 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
 from harnack import arithmetic
 from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
 from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
+from harnack.fields.tape_evaluator import recorded_tape
+from harnack.fields.vm_formulas import VmFormula
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
+    import os
+
     from harnack.geometry import Volume
 
 _COORDINATES = ("x", "y", "z")
@@ -50,7 +54,10 @@ _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProx
 )
 # The largest number of characters of a text, and of operations that are nested in each other.
 # Python allows about 1000 nested calls.
-_MAX_LENGTH, _MAX_DEPTH = 4000, 200
+_MAX_LENGTH, _MAX_DEPTH = 1_000_000, 200
+_TOO_DEEP = (
+    f"more than {_MAX_DEPTH} operations are within each other, as in a long sum: bracket its halves"
+)
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,9 @@ class TextFormula:
         """
         try:
             return ast.parse(" ".join(side.replace("^", "**").split()), mode="eval").body
-        except (SyntaxError, ValueError, RecursionError, MemoryError):
+        except (RecursionError, MemoryError):
+            raise _formula_error(text, _TOO_DEEP) from None
+        except (SyntaxError, ValueError):
             pass
         # Guess the mistake: a function without brackets, as in "sin x", or a missing *, as in "2
         # x".
@@ -175,7 +184,7 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
     depth: the number of operations around the node.
     """
     if depth > _MAX_DEPTH:
-        raise _formula_error(text, f"more than {_MAX_DEPTH} operations are within each other")
+        raise _formula_error(text, _TOO_DEEP)
     # An operation with two operands; then signs, names, numbers, calls; all else is refused.
     if isinstance(node, ast.BinOp):
         if not isinstance(node.op, ast.Pow) and type(node.op) not in _OPERATORS:
@@ -354,8 +363,10 @@ class Expression(Formula):
         object.__setattr__(self, "function", function)  # the dataclass is frozen
         object.__setattr__(self, "default_level", as_finite(self.default_level, "level"))
         object.__setattr__(self, "is_convex", flag(self.is_convex, "is_convex"))
-        # Evaluate the formula once at an arbitrary point, as a test: this raises the errors that
-        # the docstring of `expression` names.
+        if recorded_tape(self) is not None:
+            return
+        # What cannot be recorded is evaluated once at an arbitrary point, as a test: this raises
+        # the errors that the docstring of `expression` names.
         point = probe_jets()
         value = as_jet(self.formula(*point), point[0], "expression")
         check_no_derivatives("an expression", value)
@@ -364,6 +375,56 @@ class Expression(Formula):
         return self.function(x, y, z)
 
 
+class ExpressionFunction(Protocol):
+    """The type of `expression`: a function that also reads formulas from files."""
+
+    def __call__(
+        self,
+        function: Callable[[Any, Any, Any], Any] | str,
+        *,
+        parameters: Mapping[str, float] | None = None,
+        domain: Volume | None = None,
+        level: float = 0.0,
+        is_convex: bool = False,
+    ) -> Expression: ...
+
+    def from_vm(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        domain: Volume | None = None,
+        level: float = 0.0,
+    ) -> Expression:
+        """See `_from_vm`."""
+        ...
+
+
+def _from_vm(
+    path: str | os.PathLike[str], *, domain: Volume | None = None, level: float = 0.0
+) -> Expression:
+    """The implicit surface of a formula in a file of the format .vm, which libfive and Fidget
+    write. Such formulas may have many thousands of instructions: they are interpreted, and not
+    compiled.
+
+    path: the file.
+    domain, level: as for `expression`.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no formula; the message names the line.
+        TypeError: domain is not a volume.
+    """
+    return Expression(VmFormula.read(path), domain, default_level=level)
+
+
+def _with_files(function: Callable[..., Expression]) -> ExpressionFunction:
+    """The function `expression` with `from_vm` as an attribute."""
+    result: Any = function
+    result.from_vm = _from_vm
+    return result
+
+
+@_with_files
 @no_derivatives
 def expression(
     function: Callable[[Any, Any, Any], Any] | str,
@@ -390,8 +451,9 @@ def expression(
     is_convex: your promise that the function is convex, as quadrics and norms are. Then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
-    Warns if the formula is so long that its first trace takes more than about ten seconds to
-    compile.
+    A formula of more than some forty operations is interpreted, so that it may have thousands. One
+    that uses arrays of Dr.Jit is compiled, with a warning if that takes more than about ten
+    seconds.
 
     Raises:
         TypeError: function cannot be called with three coordinates, or uses operations without

@@ -465,11 +465,16 @@ def hessian_error(jet: Jet, like: Real) -> Real:
 
 
 def warn_if_slow_to_compile(field: Formula) -> None:
-    """Warn if the kernel of a formula will take more than about ten seconds to compile.
+    """Warn if the kernel of a formula will take more than about ten seconds to compile. (One that
+    can be recorded is interpreted if it is long.)
 
     On an idle core LLVM took 0.9 s for 11,000 operations, 2.7 s for 32,000, 7.4 s for 53,000 and 30
     s for 100,000. So the time grows about as the number of operations to the power 2.2.
     """
+    from harnack.fields.tape_evaluator import recorded_tape
+
+    if recorded_tape(field) is not None:
+        return
     operations = tally_of(field.formula).operations
     seconds = 30 * (operations / 1e5) ** 2.2
     if seconds > _SLOW_COMPILE_SECONDS:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from harnack.fields.evaluator import Plan
     from harnack.fields.field import Field
 
-__all__ = ["TapeEvaluator", "tape_evaluator"]
+__all__ = ["TapeEvaluator", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted; shorter ones are compiled.
 _MIN_INSTRUCTIONS = 40
@@ -67,8 +67,8 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
 
     field: a field with a method `formula`.
     """
-    tape = _TAPES.get(field, None, lambda: _record_long(field))
-    if tape is None:
+    tape = recorded_tape(field)
+    if tape is None or len(tape) <= _MIN_INSTRUCTIONS:
         return None
     levels = plan.levels or (field.default_level,)
     host = _CELLS.get(
@@ -86,13 +86,17 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
     return TapeEvaluator(field, whole, constant, program, grid, host, is_drawn=bool(plan.levels))
 
 
-def _record_long(field: Any) -> Tape | None:
-    """The tape of a field's formula, if it is long and can be recorded."""
+def recorded_tape(field: Any) -> Tape | None:
+    """The tape of a field's formula; None if it cannot be recorded. field: a field with a method
+    `formula`."""
+    return _TAPES.get(field, None, lambda: _record_or_none(field))
+
+
+def _record_or_none(field: Any) -> Tape | None:
     try:
-        tape = record(field.formula)
+        return record(field.formula)
     except TypeError:  # it accepts ranges of derivatives alone
         return None
-    return tape if len(tape) > _MIN_INSTRUCTIONS else None
 
 
 def _cells_of(field: Field, tape: Tape, levels: tuple[float, ...]) -> TapeCells | None:

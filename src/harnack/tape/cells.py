@@ -61,7 +61,7 @@ class TapeCells(GridData):
         Proof that a cell is empty: the range of the formula on the enlarged cell does not contain a
         level.
         """
-        depth = int(np.clip(round(1.5 + np.log2(len(tape)) / 3), _MIN_DEPTH, _MAX_DEPTH))
+        depth = int(np.clip(round(2.5 + np.log2(len(tape)) / 3), _MIN_DEPTH, _MAX_DEPTH))
         reach = float(np.abs([lower, upper]).max())
         longest = float((upper - lower).max()) * (1 + _BORDER)
         while depth > 0 and longest / 2**depth < _MIN_CELL * reach:

@@ -115,10 +115,10 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     # Which operand is read from local memory, and which one by an instruction of its own. A list
     # that consists of a coordinate reads it.
     first, second, third = lists.operands
-    reads_first = ((arity == 1) & ~is_before[0]) | ((arity == 2) & ~is_before[0]) | (arity == 3)
-    reads_first &= ~((arity == 2) & is_before[0])
-    reads_second = (arity == 2) & is_before[0] & (second != first)
-    loads = (arity >= 2) & ~is_before[1] & ~reads_second & ~((arity == 2) & (second == first))
+    is_twice = (arity == 2) & (second == first)
+    reads_first = ((arity >= 1) & ~is_before[0]) | (arity == 3)
+    reads_second = (arity == 2) & np.where(is_twice, reads_first, is_before[0])
+    loads = (arity >= 2) & ~is_before[1] & ~reads_second
     is_plain_load = ~is_run & is_last
     loaded = np.where(loads, second, entries)
     operand = np.where(reads_second, second, first)

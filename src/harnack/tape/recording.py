@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.functions import exp, log, power, sqrt
+from harnack.arithmetic.functions import exp, log, power, reciprocal, sqrt
 from harnack.arithmetic.operators import FormulaNumber, exponent_of
 from harnack.backend import FloatArray, IntArray
 from harnack.tape.operations import (
@@ -244,17 +244,20 @@ class TapeNumber(FormulaNumber):
         """This number times a constant. Of a constant, an instruction: the product is rounded."""
         if not self.terms and not _is_exact_product(self.shift, factor):
             return self.recorded._scaled(factor)
-        result = self._scaled(factor)
-        if self.roots and factor == 1.0:
-            return TapeNumber(self.recorder, result.terms, result.shift, self.roots)
-        return result
+        result, roots = self._scaled(factor), self.roots
+        if not roots or factor <= 0.0:
+            return result
+        if factor != 1.0:
+            scale = self.constant(factor).recorded.apply(sqrt)
+            roots = tuple(root.product(scale) for root in roots)
+        return TapeNumber(self.recorder, result.terms, result.shift, roots)
 
     def __truediv__(self, other: Any) -> Any:
         b = self._coerce_or_none(other)
         if b is None:
             return NotImplemented
         if b.terms:
-            return self.product(b.apply(_reciprocal()))
+            return self.product(b.apply(reciprocal))
         if b.shift == 0.0:
             raise ZeroDivisionError("a formula divides by the constant 0")
         inverse = 1.0 / b.shift
@@ -325,12 +328,6 @@ class TapeNumber(FormulaNumber):
             return None
         operation = blend_operation(literals[0], is_union=name == "blended union")
         return self._instruction(operation, [a, b], [radius.shift])
-
-
-def _reciprocal() -> ElementaryFunction:
-    from harnack.arithmetic.functions import reciprocal
-
-    return reciprocal
 
 
 def _is_exact_sum(a: float, b: float) -> bool:

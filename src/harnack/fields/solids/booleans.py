@@ -30,7 +30,7 @@ from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, Negate
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import on_backend, own_formula, probe_jets
+from harnack.fields.formula import has_own_formula, on_backend, own_formula, probe_jets
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
     FormulaSolid,
@@ -585,6 +585,16 @@ class _OffsetSolidEvaluator(EvaluatorOfInner):
         return replace(ray_sample, sample=self._shifted(ray_sample.sample))
 
 
+def _check_formula(solid: Solid) -> None:
+    """Raise TypeError for a solid without a formula. What is a `FormulaSolid` has one; a
+    combination, if its parts do; and other solids are asked."""
+    if isinstance(solid, BooleanSolid):
+        for part in solid.parts:
+            _check_formula(part)
+    elif not (isinstance(solid, FormulaSolid) and has_own_formula(solid)):
+        own_formula(solid)(*probe_jets())
+
+
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet where their surfaces meet. Its function
@@ -625,7 +635,7 @@ class BlendedSolid(FormulaSolid):
         for part in self.parts:
             if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(part))
-            own_formula(part)(*probe_jets())  # raises TypeError for a solid without a formula
+            _check_formula(part)
         constants = [part.lipschitz for part in self.parts]
         all_known = all(part is not None for part in constants)
         # The constant of the blend of two functions, with a margin for rounding.
