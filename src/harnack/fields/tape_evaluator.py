@@ -6,21 +6,21 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic import Jet
+from harnack.arithmetic import Interval, Jet
 from harnack.arithmetic.operators import OperationCounter, Tally
-from harnack.backend.arrays import upload_integers
+from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.elementary import fmin, max_norm, safe_norm
 from harnack.enclosures import SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import RaySample
-from harnack.fields.batched_fields import FieldCache
+from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.formula import Formula, FormulaEvaluator, FormulaOnRay
 from harnack.tape.cells import CELL_MARGIN, TapeCells
 from harnack.tape.interpreter import TapeProgram
@@ -44,22 +44,25 @@ _MIN_INSTRUCTIONS = 40
 _ROUNDINGS = 512.0
 
 
-@dataclass(frozen=True)
-class _HostTape:
-    """The tape of a field with its cells, in NumPy.
+# For each field its tape, and its cells by levels.
+_TAPES: FieldCache[Tape | None] = FieldCache()
+_CELLS: FieldCache[dict[tuple[float, ...], TapeCells | None]] = FieldCache()
+# The largest number of levels for which the cells of a field are kept.
+_MAX_KEPT = 4
 
-    cells: None if the surface lies in no known box.
+
+@dataclass(frozen=True)
+class _UploadedTape:
+    """The lists of a field on a backend.
+
+    program: the lists.
+    grid: the cells; None if the surface lies in no known box.
+    cells: the same in NumPy.
     """
 
-    tape: Tape
+    program: TapeProgram
+    grid: _CellGrid | None
     cells: TapeCells | None
-    levels: tuple[float, ...]
-
-
-# For each field its tape; and its cells for the levels of the last call.
-_TAPES: FieldCache[Tape | None] = FieldCache()
-_CELLS: FieldCache[_HostTape] = FieldCache()
-_PROGRAMS: FieldCache[dict[Any, tuple[TapeProgram, _CellGrid | None]]] = FieldCache()
 
 
 def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | None:
@@ -70,20 +73,28 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
     tape = recorded_tape(field)
     if tape is None or len(tape) <= _MIN_INSTRUCTIONS:
         return None
-    levels = plan.levels or (field.default_level,)
-    host = _CELLS.get(
-        field, levels, lambda: _HostTape(tape, _cells_of(field, tape, levels), levels)
-    )
-    uploads = _PROGRAMS.get(field, levels, dict)
-    if backend not in uploads:
-        lists = BoxTapes.whole(tape) if host.cells is None else host.cells.lists
-        grid = None if host.cells is None else _CellGrid.upload(backend, host.cells)
-        uploads[backend] = TapeProgram.upload(backend, lists), grid
-    program, grid = uploads[backend]
+    uploaded: _UploadedTape = _upload(field, backend, plan.levels)
     lipschitz = getattr(field, "lipschitz", None)
     constant = dr.opaque(backend.Float, float(lipschitz)) if lipschitz is not None else None
-    whole = program.formula(dr.opaque(backend.UInt32, 0))
-    return TapeEvaluator(field, whole, constant, program, grid, host, is_drawn=bool(plan.levels))
+    whole = uploaded.program.formula(dr.opaque(backend.UInt32, 0))
+    return TapeEvaluator(field, whole, constant, uploaded, tape)
+
+
+@cached_upload
+def _upload(field: Any, backend: Backend, levels: tuple[float, ...]) -> _UploadedTape:
+    """Upload the lists of a field, for levels; () for all values."""
+    tape = recorded_tape(field)
+    assert tape is not None
+    kept = _CELLS.get(field, None, dict)
+    if levels not in kept:
+        while len(kept) >= _MAX_KEPT:
+            del kept[next(iter(kept))]
+        kept[levels] = _cells_of(field, tape, levels)
+    cells = kept[levels]
+    if cells is None:
+        return _UploadedTape(TapeProgram.upload(backend, BoxTapes.whole(tape)), None, None)
+    program = TapeProgram.upload(backend, cells.lists)
+    return _UploadedTape(program, _CellGrid.upload(backend, cells), cells)
 
 
 def recorded_tape(field: Any) -> Tape | None:
@@ -100,8 +111,9 @@ def _record_or_none(field: Any) -> Tape | None:
 
 
 def _cells_of(field: Field, tape: Tape, levels: tuple[float, ...]) -> TapeCells | None:
-    """The cells over the box that contains the level sets; None if there is no such box."""
-    extent = field.extent(levels)
+    """The cells over the box that contains the level sets; None if there is no such box. levels: ()
+    for all values, over the box of the default level."""
+    extent = field.extent(levels or (field.default_level,))
     if extent is None:
         return None
     lower, upper = (np.array(corner, np.float64) for corner in extent.bounds())
@@ -115,53 +127,92 @@ class _CellGrid(EmptySpaceGrid):
     """The grid of cells on a backend.
 
     list_of_cell: for each cell the index of its list.
+    sides: for each list the number of cells along a side of the block that has it.
+    floors, caps: for each list the limits between which it computes values rightly; None if it
+        computes all values rightly.
     """
 
     list_of_cell: Index
+    sides: Index
+    floors: Real | None
+    caps: Real | None
 
     @classmethod
     def upload(cls, backend: Backend, cells: TapeCells) -> _CellGrid:
-        layout = cls.upload_layout(backend, cells)
-        return cls(*layout, CELL_MARGIN, upload_integers(backend, cells.list_of_cell))
+        layout, limits = cls.upload_layout(backend, cells), cells.limits
+        lists, sides = (upload_integers(backend, a) for a in (cells.list_of_cell, cells.sides))
+        if not limits.levels:
+            return cls(*layout, CELL_MARGIN, lists, sides, None, None)
+        floors, caps = (upload_floats(backend, a) for a in (limits.floor, limits.cap))
+        return cls(*layout, CELL_MARGIN, lists, sides, floors, caps)
 
-    def list_at(self, p: Vec3, t: Real) -> tuple[Index, Mask]:
-        """The list that is valid in the cell of p; and whether it is that of a cell: not outside of
-        the grid, nor where rounding may move points out of the margin of the cell.
+    def block_at(self, p: Vec3, t: Real) -> _Block:
+        """The block of cells with one list in which p lies.
 
         t: the parameter of the ray on which p lies; 0 for no ray.
         """
-        cell = self.cell(p)
-        position, shape = cell.cell_coordinates, self.shape
-        is_inside = position.x >= 0
+        kind, cell = self.backend.UInt32, self.cell(p)
+        position = cell.cell_coordinates
+        is_valid = position.x >= 0
         for k in range(3):
-            is_inside &= (position[k] >= 0) & (position[k] < shape[k])
+            is_valid &= (position[k] >= 0) & (position[k] < self.shape[k])
         rounding = _ROUNDINGS * self.backend.machine_epsilon * (max_norm(p) + dr.abs(t))
-        is_inside &= rounding < 0.25 * self.margin * self.cell_size
-        index = dr.select(is_inside, cell.index, 0)
-        lists = dr.gather(self.backend.UInt32, self.list_of_cell, index)
-        return dr.select(is_inside, lists, 0), is_inside
+        is_valid &= rounding < 0.25 * self.margin * self.cell_size
+        index = dr.gather(kind, self.list_of_cell, dr.select(is_valid, cell.index, 0))
+        index = dr.select(is_valid, index, 0)
+        side = self.backend.Float(dr.gather(kind, self.sides, index))
+        corner = dr.floor(cell.corner / side) * side
+        return _Block(self, index, is_valid, position - corner, side)
 
-    def exit_length(self, p: Vec3, d: Vec3) -> Real:
-        """The length up to which the path from p, in a cell of the grid, in direction d stays in
-        the middle of the margin around the cell."""
-        cell = self.cell(p)
-        length: Real = self.backend.Float(dr.inf)
-        margin = 0.5 * self.margin
+
+@dataclass(frozen=True)
+class _Block:
+    """The block of cells in which a point lies, for each lane.
+
+    index: of its list.
+    is_valid: False for points outside of the grid, and where rounding may move points out of the
+        margin of a block: there the list is the whole tape.
+    offset: the point relative to the lower corner of the block, in cells.
+    side: of the block, in cells.
+    """
+
+    grid: _CellGrid
+    index: Index
+    is_valid: Mask
+    offset: Vec3
+    side: Real
+
+    def exit_length(self, d: Vec3) -> Real:
+        """The length up to which the path from the point in direction d stays in the inner half of
+        the margin around the block; infinite where the list is the whole tape."""
+        length: Real = self.grid.backend.Float(dr.inf)
         for k in range(3):
-            offset = cell.cell_coordinates[k] - cell.corner[k]
-            gap = dr.select(d[k] > 0, 1 - offset, offset) + margin
+            gap = dr.select(d[k] > 0, self.side - self.offset[k], self.offset[k])
+            gap = gap + 0.5 * self.grid.margin
             length = fmin(length, dr.select(d[k] == 0, dr.inf, gap / dr.abs(d[k])))
-        return length * self.cell_size
+        return dr.select(self.is_valid, length * self.grid.cell_size, dr.inf)
 
-    def border_distance(self, p: Vec3) -> Real:
-        """The distance of a point p in a cell of the grid from the middle of the margin around the
-        cell."""
-        cell = self.cell(p)
-        nearest: Real = self.backend.Float(dr.inf)
+    def border_distance(self) -> Real:
+        """The distance of the point from the middle of the margin around the block; infinite where
+        the list is the whole tape."""
+        nearest: Real = self.grid.backend.Float(dr.inf)
         for k in range(3):
-            offset = cell.cell_coordinates[k] - cell.corner[k]
-            nearest = fmin(nearest, fmin(offset, 1 - offset) + 0.5 * self.margin)
-        return nearest * self.cell_size
+            nearest = fmin(nearest, fmin(self.offset[k], self.side - self.offset[k]))
+        nearest = nearest + 0.5 * self.grid.margin
+        return dr.select(self.is_valid, nearest * self.grid.cell_size, dr.inf)
+
+    def exact(self, program: TapeProgram, p: Vec3) -> _Block:
+        """The block, or the whole tape where the value at p is not within the limits of its
+        list."""
+        if self.grid.floors is None:
+            return self
+        zero = 0 * p.x
+        numbers = [Jet(Interval.point(p[k]), (), (), piece_length=zero) for k in range(3)]
+        value = program.formula(self.index)(*numbers).value
+        kind = self.grid.backend.Float
+        floor, cap = (dr.gather(kind, a, self.index) for a in (self.grid.floors, self.grid.caps))
+        is_valid = self.is_valid & (value.lower > floor) & (value.upper < cap)
+        return replace(self, index=dr.select(is_valid, self.index, 0), is_valid=is_valid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,24 +220,23 @@ class TapeEvaluator(FormulaEvaluator):
     """The evaluator of a formula by its tape. In a cell of the grid it runs the list of the cell.
 
     Proof. The list of a cell gives the formula's values in the cell enlarged by its margin
-    (`TapeCells`). Samples at a point in the cell use points in half of the margin: on a ray, a
-    length that ends there; in all directions, a ball that ends there. The other half is for
-    rounding, which `list_at` compares with it.
+    (`TapeCells`), or a function with the same level sets there. Samples at a point in the cell use
+    points in half of the margin: on a ray, a length that ends there; in all directions, a ball that
+    ends there. The other half is for rounding, which `block_at` compares with it. Samples on rays
+    are of the function of the list, which takes a level where the formula does, and is the same
+    near it. Samples at points, which are used for more than levels, are of the formula itself:
+    where the value of a list may differ from it, the whole tape is run.
 
-    program: the lists.
-    grid: the cells; None if there are none.
-    host: the tape and its cells in NumPy.
-    is_drawn: whether the cells were made for the levels of the plan.
+    uploaded: the lists.
+    tape: the whole tape.
     """
 
-    program: TapeProgram
-    grid: _CellGrid | None
-    host: _HostTape
-    is_drawn: bool
+    uploaded: _UploadedTape
+    tape: Tape
 
     @functools.cached_property
     def tally(self) -> Tally:
-        return _tally_of_tape(self.host.tape)
+        return _tally_of_tape(self.tape)
 
     @functools.cached_property
     def may_jump(self) -> bool:
@@ -200,43 +250,41 @@ class TapeEvaluator(FormulaEvaluator):
     def is_convex(self) -> bool:
         return getattr(self.field, "is_convex", False)
 
-    def _near(self, p: Vec3, t: Real) -> tuple[FormulaEvaluator, Mask | None]:
-        """The evaluator of the list at p, and whether it is that of a cell; None for no cells."""
-        grid = self.grid
-        if grid is None:
-            return self._with_list(self.formula, None), None
-        index, is_inside = grid.list_at(p, t)
-        radius = dr.select(is_inside, grid.border_distance(p), dr.inf)
-        return self._with_list(self.program.formula(index), radius), is_inside
-
     def _with_list(self, formula: Any, radius: Real | None) -> FormulaEvaluator:
         """The evaluator of a formula that is valid within a radius; None for everywhere."""
         return _ListEvaluator(self.field, formula, self.lipschitz, self, radius)
 
+    def _at(self, p: Vec3) -> FormulaEvaluator:
+        """The evaluator of f at points p."""
+        grid, program = self.uploaded.grid, self.uploaded.program
+        if grid is None:
+            return self._with_list(self.formula, None)
+        block = grid.block_at(p, 0.0 * p.x).exact(program, p)
+        return self._with_list(program.formula(block.index), block.border_distance())
+
     def evaluate(self, p: Vec3) -> Sample:
-        return self._near(p, 0.0 * p.x)[0].evaluate(p)
+        return self._at(p).evaluate(p)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
-        return self._near(p, 0.0 * p.x)[0].hessian(p)
+        return self._at(p).hessian(p)
 
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
-        return self._near(p, 0.0 * p.x)[0].derivative_errors(p, sample)
+        return self._at(p).derivative_errors(p, sample)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
-        p = path.point(t)
-        near, is_inside = self._near(p, t)
-        if is_inside is not None:
-            assert self.grid is not None
-            to_exit = self.grid.exit_length(p, path.direction)
-            ahead = dr.select(is_inside, fmin(ahead, to_exit), ahead)
+        p, d = path.point(t), path.direction
+        near = self._with_list(self.formula, None)
+        if self.uploaded.grid is not None:
+            block = self.uploaded.grid.block_at(p, t)
+            formula = self.uploaded.program.formula(block.index)
+            near = self._with_list(formula, block.border_distance())
+            ahead = fmin(ahead, block.exit_length(d))
         uses_ranges = PiecewiseTaylorEnclosure in path.proofs.kinds
         if self.may_jump or self.is_abrupt or self.is_convex or not uses_ranges:
             return near.sample_ray(path, t, ahead, back)
         # As there, with a single loop for the jets at the point and on the ray.
-        d = path.direction
-        at_point, on_piece = near.formula.of_several(
-            [Jet.at_point(p), Jet.along_ray(p, d, 0.0, ahead)]
-        )
+        formula: Any = near.formula
+        at_point, on_piece = formula.of_several([Jet.at_point(p), Jet.along_ray(p, d, 0.0, ahead)])
         start = on_piece.jet_at_start
         (slope,), (slopes,), (curvatures,) = (
             start.first_derivatives, on_piece.first_derivatives, on_piece.second_derivatives
@@ -258,8 +306,8 @@ class TapeEvaluator(FormulaEvaluator):
         return self._with_list(self.formula, None).restrict(p, direction)
 
     def occupied_cells(self) -> OccupancyGrid | None:
-        cells = self.host.cells
-        if cells is None or not self.is_drawn:
+        cells = self.uploaded.cells
+        if cells is None or not cells.limits.levels:
             return None
         return OccupancyGrid(cells.origin, cells.cell_size, cells.shape, cells.empty_distance)
 

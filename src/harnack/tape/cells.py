@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.tape.pruning import BoxTapes
+from harnack.tape.pruning import BoxLimits, BoxTapes, PrunedTapes
 from harnack.tree.empty_space import GridData, distance_to_occupied, round_to_short_float
 
 if TYPE_CHECKING:
-    from harnack.backend import FloatArray, IntArray
+    from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.tape.recording import Tape
 
 __all__ = ["CELL_MARGIN", "TapeCells"]
@@ -23,7 +23,7 @@ CELL_MARGIN = 1 / 8
 """How far beyond a cell its tape is valid, as a fraction of the cell's size."""
 
 # Cells are not divided if their list has at most this many entries.
-_SHORT_LIST = 6
+_SHORT_LIST = 4
 # Cells are not smaller than this fraction of the largest coordinate, so that rounding in single
 # precision moves points by far less than the margin.
 _MIN_CELL = 2.0**-13
@@ -31,6 +31,8 @@ _MIN_CELL = 2.0**-13
 _BORDER = 1 / 16
 # The smallest and the largest number of times that the box is divided.
 _MIN_DEPTH, _MAX_DEPTH = 3, 6
+# Where all values matter, lists are longer, and the box is divided this number of times less.
+_COARSER = 2
 # Cells are divided no further if the lists of all of their octants would have more entries; and the
 # number of entries that are treated at once, so that they stay in the processor's cache.
 _MAX_ENTRIES, _ENTRIES_AT_ONCE = 24_000_000, 400_000
@@ -43,10 +45,15 @@ class TapeCells(GridData):
     `CELL_MARGIN`. A cell is empty if the formula takes no level there.
 
     lists: the lists. The first is that of the whole tape, for all of space.
+    limits: for each list, which values it computes rightly.
+    sides: for each list (lists,) the number of cells along a side of the block of cells that have
+        it. A block of n^3 cells begins at a multiple of n. (1 for the whole tape.)
     list_of_cell: (cells,) for each cell, x fastest, the index of its list.
     """
 
     lists: BoxTapes
+    limits: BoxLimits
+    sides: IntArray
     list_of_cell: IntArray
 
     @classmethod
@@ -56,12 +63,15 @@ class TapeCells(GridData):
         """Make the grid over a box.
 
         lower, upper: (3,) the corners of the box.
-        levels: cells in which the formula takes none of them are empty, and not divided further.
+        levels: cells in which the formula takes none of them are empty, and not divided further;
+            and in other cells values far from them are not computed rightly (`BoxLimits`). () if
+            all values matter everywhere.
 
         Proof that a cell is empty: the range of the formula on the enlarged cell does not contain a
         level.
         """
-        depth = int(np.clip(round(2.5 + np.log2(len(tape)) / 3), _MIN_DEPTH, _MAX_DEPTH))
+        depth = round(2.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
+        depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
         reach = float(np.abs([lower, upper]).max())
         longest = float((upper - lower).max()) * (1 + _BORDER)
         while depth > 0 and longest / 2**depth < _MIN_CELL * reach:
@@ -72,17 +82,31 @@ class TapeCells(GridData):
         blocks = -(-shape // 2**depth)
         octree = _Octree(origin, size, levels)
         indices = np.indices(blocks).reshape(3, -1).T
-        level = BoxTapes.whole(tape).subset(np.zeros(len(indices), np.int64))
+        lists = BoxTapes.whole(tape).subset(np.zeros(len(indices), np.int64))
+        limits = BoxLimits.unlimited(len(indices), levels)
         for rest in range(depth, -1, -1):
-            level, indices = octree.divide(level, indices, rest)
-            if not len(level):
+            lists, indices, limits = octree.divide(lists, indices, limits, rest)
+            if not len(lists):
                 break
         shape = blocks * 2**depth
         list_of_cell, is_empty = octree.fill(tuple(shape[::-1].tolist()))
-        lists = BoxTapes.concatenated([BoxTapes.whole(tape), *octree.parts])
+        lists = BoxTapes.concatenated([BoxTapes.whole(tape), *(p.lists for p in octree.parts)])
+        whole = BoxLimits.unlimited(1, levels)
+        limits = BoxLimits(
+            np.concatenate([whole.floor, *(part.limits.floor for part in octree.parts)]),
+            np.concatenate([whole.cap, *(part.limits.cap for part in octree.parts)]),
+            levels,
+        )
         counts = (int(shape[0]), int(shape[1]), int(shape[2]))
         return cls(
-            origin, size, counts, distance_to_occupied(is_empty), lists, list_of_cell.ravel()
+            origin,
+            size,
+            counts,
+            distance_to_occupied(is_empty),
+            lists,
+            limits,
+            np.concatenate([[1], *octree.sides]),
+            list_of_cell.ravel(),
         )
 
 
@@ -97,44 +121,72 @@ class _Octree:
     def __init__(self, origin: FloatArray, size: float, levels: tuple[float, ...]) -> None:
         """origin, size: the lower corner of the grid, and the size of its smallest cells."""
         self._origin, self._size, self._levels = origin, size, levels
-        self.parts: list[BoxTapes] = []
-        self.leaves: list[tuple[IntArray, int, FloatArray]] = []
+        self.parts: list[PrunedTapes] = []
+        self.leaves: list[tuple[IntArray, int, BoolArray]] = []
 
-    def divide(self, level: BoxTapes, indices: IntArray, rest: int) -> tuple[BoxTapes, IntArray]:
-        """Prune the lists of cells of one size, keep those that are not divided, and return the
-        octants of the others.
+    @property
+    def sides(self) -> list[IntArray]:
+        """For each part the sides of its cells, in smallest cells."""
+        return [np.full(len(indices), 2**rest) for indices, rest, _ in self.leaves]
 
-        level: the lists of the cells, pruned for larger boxes around them.
+    def divide(
+        self, lists: BoxTapes, indices: IntArray, limits: BoxLimits, rest: int
+    ) -> tuple[BoxTapes, IntArray, BoxLimits]:
+        """Prune the lists of cells of one size, keep those that are not divided, and return lists,
+        indices and limits of the octants of the others.
+
+        lists: the lists of the cells, pruned for larger boxes around them.
         indices: (n, 3) of the cells in a grid of their own size.
-        rest: how many times they could be divided.
+        limits: those of the lists.
+        rest: how many times the cells could be divided.
         """
-        next_lists: list[BoxTapes] = []
-        next_indices: list[IntArray] = []
-        kept: list[tuple[BoxTapes, IntArray, FloatArray]] = []
-        for cells in _batches(level.lengths):
-            lower = self._origin + self._size * 2**rest * indices[cells]
-            margin = self._size * CELL_MARGIN * (1 + 1e-9)
-            lists, low, high = level.subset(cells).pruned(
-                lower - margin, lower + self._size * 2**rest + margin
-            )
-            is_empty = np.ones(len(cells), np.bool_)
-            for value in self._levels:
-                is_empty &= ~((low <= value) & (high >= value))
-            is_divided = ~is_empty & (lists.lengths > _SHORT_LIST) & (rest > 0)
-            kept.append((lists, is_divided, is_empty))
-        entry_count = sum(8 * int(lists.lengths[divided].sum()) for lists, divided, _ in kept)
-        for (lists, is_divided, is_empty), cells in zip(kept, _batches(level.lengths), strict=True):
-            if entry_count > _MAX_ENTRIES:
-                is_divided = np.zeros_like(is_divided)
-            leaves, inner = np.flatnonzero(~is_divided), np.flatnonzero(is_divided)
-            self.parts.append(lists.subset(leaves))
-            self.leaves.append((indices[cells][leaves], rest, is_empty[leaves]))
-            octants = 2 * indices[cells][inner][:, None] + _OCTANTS
-            next_indices.append(octants.reshape(-1, 3))
-            next_lists.append(lists.subset(np.repeat(inner, 8)))
-        return BoxTapes.concatenated(next_lists), np.concatenate(next_indices)
+        batches = _batches(lists.lengths)
+        results = [self._pruned(lists, indices, limits, rest, cells) for cells in batches]
+        is_divided = [
+            ~self._is_empty(part) & (part.lists.lengths > _SHORT_LIST) & (rest > 0)
+            for part in results
+        ]
+        entry_count = sum(
+            8 * int(part.lists.lengths[divided].sum())
+            for part, divided in zip(results, is_divided, strict=True)
+        )
+        octants: list[tuple[BoxTapes, IntArray, BoxLimits]] = []
+        for part, divided, cells in zip(results, is_divided, batches, strict=True):
+            divided &= entry_count <= _MAX_ENTRIES
+            leaves, inner = np.flatnonzero(~divided), np.flatnonzero(divided)
+            self.parts.append(_subset(part, leaves))
+            self.leaves.append((indices[cells][leaves], rest, self._is_empty(self.parts[-1])))
+            children = np.repeat(inner, 8)
+            places = (2 * indices[cells][inner][:, None] + _OCTANTS).reshape(-1, 3)
+            octants.append((part.lists.subset(children), places, part.limits.subset(children)))
+        return (
+            BoxTapes.concatenated([entry[0] for entry in octants]),
+            np.concatenate([entry[1] for entry in octants]),
+            BoxLimits(
+                np.concatenate([entry[2].floor for entry in octants]),
+                np.concatenate([entry[2].cap for entry in octants]),
+                limits.levels,
+            ),
+        )
 
-    def fill(self, shape: tuple[int, ...]) -> tuple[IntArray, FloatArray]:
+    def _pruned(
+        self, lists: BoxTapes, indices: IntArray, limits: BoxLimits, rest: int, cells: IntArray
+    ) -> PrunedTapes:
+        """The lists of some cells, pruned for these cells with their margins (`divide`)."""
+        size = self._size * 2**rest
+        lower, margin = self._origin + size * indices[cells], self._size * CELL_MARGIN * (1 + 1e-9)
+        return lists.subset(cells).pruned(
+            lower - margin, lower + size + margin, limits.subset(cells)
+        )
+
+    def _is_empty(self, part: PrunedTapes) -> BoolArray:
+        """Whether the formula takes no level in the cells of a part; False without levels."""
+        is_empty = np.full(len(part.lists), bool(self._levels))
+        for value in self._levels:
+            is_empty &= (part.low > value) | (part.high < value)
+        return is_empty
+
+    def fill(self, shape: tuple[int, ...]) -> tuple[IntArray, BoolArray]:
         """For each cell of the grid the index of its list, after that of the whole tape, and
         whether it is empty: two arrays of this shape (z, y, x)."""
         list_of_cell, is_empty = np.zeros(shape, np.int64), np.zeros(shape, np.bool_)
@@ -153,6 +205,13 @@ class _Octree:
                 blocks[z, y, x] = values[:, None, None, None]
             first += len(indices)
         return list_of_cell, is_empty
+
+
+def _subset(part: PrunedTapes, which: IntArray) -> PrunedTapes:
+    """The lists of the boxes with these indices."""
+    return PrunedTapes(
+        part.lists.subset(which), part.low[which], part.high[which], part.limits.subset(which)
+    )
 
 
 def _batches(lengths: IntArray) -> list[IntArray]:

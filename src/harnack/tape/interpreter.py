@@ -216,9 +216,12 @@ class TapeFormula:
 
         start = self.begin + backend.UInt32(0 * zero)
         last = [zero for _ in memory]
+        # Dr.Jit takes kernels that differ in the size of local memory alone for one, and would run
+        # the one with too little of it. The label is a part of the kernel's text.
         _, parts, _ = dr.while_loop(
-            (start, last, memory), lambda k, last, memory: k < self.end, body, label="tape"
-        )
+            (start, last, memory), lambda k, last, memory: k < self.end, body,
+            label=f"tape{program.slot_count}",
+        )  # fmt: skip
         return _numbers_of_parts(layouts, parts, numbers)
 
     def _memory(self, layouts: list[_Layout], numbers: list[Any], zero: Real) -> list[Any]:

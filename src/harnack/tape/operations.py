@@ -420,7 +420,7 @@ _OPERATIONS = (
         limits=_limits_of_scale,
     ),
     Operation(
-        "divide", 1, 1, lambda a, k: a[0] * k[0].apply(reciprocal),
+        "divide", 1, 1, lambda a, k: a[0] * reciprocal(k[0]),
         lambda a, k: _product(a[0], (1.0 / k[0], 1.0 / k[0])),
     ),
     Operation("affine 1", 1, 2, _affine, _affine_ranges),
@@ -505,7 +505,7 @@ def function_operation(function: ElementaryFunction) -> Operation:
     if function.name not in _FUNCTIONS:
         choice = _choice_of_absolute if function.name == "abs" else None
         _FUNCTIONS[function.name] = Operation(
-            function.name, 1, 0, lambda a, k: a[0].apply(function), _function_ranges(function),
+            function.name, 1, 0, lambda a, k: function(a[0]), _function_ranges(function),
             choice,
         )  # fmt: skip
     return _FUNCTIONS[function.name]

@@ -2,6 +2,7 @@
 ranges of all results are computed, by interval arithmetic. Where the range of one operand of a
 minimum is below that of the other, the minimum is that operand, and what only the other one needs
 is left out (as of other choices: `operations`). The value of the formula in the box is unchanged.
+If only values near some levels matter, those are unchanged, and all others stay on their side.
 
 The lists of instructions of many boxes are stored one after another, in `BoxTapes`.
 
@@ -12,7 +13,7 @@ Sources: Duff 1992 (pruning of constructive solid geometry by interval arithmeti
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,61 @@ if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.tape.recording import Tape
 
-__all__ = ["BoxTapes"]
+__all__ = ["BoxLimits", "BoxTapes", "PrunedTapes"]
+
+
+@dataclass(frozen=True, eq=False)
+class BoxLimits:
+    """Which values of a formula matter on m boxes: a value above the cap may be replaced by any
+    other value above the cap, and one below the floor by any other below the floor.
+
+    floor, cap: (m,).
+    levels: values that matter on all boxes; () for all values.
+    """
+
+    floor: FloatArray
+    cap: FloatArray
+    levels: tuple[float, ...]
+
+    @classmethod
+    def unlimited(cls, count: int, levels: tuple[float, ...]) -> BoxLimits:
+        """No limits on `count` boxes."""
+        return cls(np.full(count, -np.inf), np.full(count, np.inf), levels)
+
+    def subset(self, which: IntArray) -> BoxLimits:
+        """The limits of the boxes with these indices."""
+        return replace(self, floor=self.floor[which], cap=self.cap[which])
+
+    def narrowed(self, low: FloatArray, high: FloatArray) -> BoxLimits:
+        """Limits farther from the levels than the formula changes in an eighth of a box, within
+        these limits: beyond them no ray comes near a level. low, high: (m,) its ranges."""
+        if not self.levels:
+            return self
+        reach = np.maximum(_LIMIT_SHARE * (high - low), 0.0)
+        return replace(
+            self,
+            floor=np.fmax(self.floor, min(self.levels) - reach),
+            cap=np.fmin(self.cap, max(self.levels) + reach),
+        )
+
+
+# How far limits are from the levels, as a fraction of the range of the formula on the box.
+_LIMIT_SHARE = 1 / 8
+
+
+@dataclass(frozen=True, eq=False)
+class PrunedTapes:
+    """Pruned lists of m boxes.
+
+    lists: the lists.
+    low, high: (m,) the ranges of the formula on the boxes.
+    limits: the values that are computed rightly.
+    """
+
+    lists: BoxTapes
+    low: FloatArray
+    high: FloatArray
+    limits: BoxLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,30 +175,29 @@ class BoxTapes:
         count = self.tape.operations[kind].constant_count
         return [column[instructions] for column in self.tape.constant_columns[:count]]
 
-    def pruned(
-        self, lower: FloatArray, upper: FloatArray
-    ) -> tuple[BoxTapes, FloatArray, FloatArray]:
-        """The lists without what cannot matter on the boxes, and the lower and the upper ends (m,)
-        of the ranges of the formula on them.
+    def pruned(self, lower: FloatArray, upper: FloatArray, limits: BoxLimits) -> PrunedTapes:
+        """The lists without what cannot matter on boxes.
 
         lower, upper: (m, 3) the corners of the boxes.
+        limits: which values of the formula matter on each box.
 
-        Proof. The ranges hold by induction, from the coordinates on. A value of the formula itself
-        matters within its range, and so everywhere: those are the limits of the last entry.
-        Going down from it, the limits of an entry are the widest that follow from the entries that
-        use it (`Operation.limits`), and where the operation chooses an operand, the entry is
-        replaced by that one. By the definition of limits no replacement changes the formula. (What
-        a replaced entry passes on are its own limits.)
+        Proof. The ranges hold by induction, from the coordinates on. The limits of the last entry
+        are those of its box. Going down from it, the limits of an entry are the widest that follow
+        from the entries that use it (`Operation.limits`), and where the operation chooses an
+        operand, the entry is replaced by that one. By the definition of limits no replacement
+        changes a value of the formula that matters. (A replaced entry passes on its own limits.)
         """
         low, high = self._ranges(lower, upper)
-        same, keeps = self._replacements(low, high)
+        result = self.results
+        limits = limits.narrowed(low[result], high[result])
+        same, keeps = self._replacements(low, high, limits)
         new_index = np.cumsum(keeps, dtype=np.int32) - 1
         kept = np.flatnonzero(keeps)
         operands = np.stack([new_index[same[column[kept]]] for column in self.operands])
         counts = np.bincount(self.boxes[kept], minlength=len(self))
         starts = np.concatenate([[0], np.cumsum(counts)])
         lists = BoxTapes(self.tape, starts, self.instructions[kept], operands)
-        return lists, low[self.results], high[self.results]
+        return PrunedTapes(lists, low[result], high[result], limits)
 
     def _ranges(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The ranges of all entries on their boxes: their lower and upper ends (n,)."""
@@ -160,12 +214,15 @@ class BoxTapes:
             low[group], high[group] = operation.rounded_ranges(ranges, constants)
         return low, high
 
-    def _replacements(self, low: FloatArray, high: FloatArray) -> tuple[IntArray, BoolArray]:
+    def _replacements(
+        self, low: FloatArray, high: FloatArray, limits_of_boxes: BoxLimits
+    ) -> tuple[IntArray, BoolArray]:
         """For each entry (n,) the entry by which it is replaced, mostly itself; and whether the
         last entry of its list still needs it (n,). low, high: (n,) the ranges of the entries."""
         count = len(self.instructions)
         floor, cap = np.full(count, np.inf), np.full(count, -np.inf)
-        floor[self.results], cap[self.results] = -np.inf, np.inf
+        floor[self.results] = limits_of_boxes.floor
+        cap[self.results] = limits_of_boxes.cap
         same, needed = np.arange(count, dtype=np.int32), np.zeros(count, np.bool_)
         needed[self.results] = True
         for kind, whole_group in reversed(self._groups):

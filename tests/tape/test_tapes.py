@@ -1,0 +1,168 @@
+"""Formulas that are recorded as tapes have the values, the level sets and the first hits of the
+formulas themselves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import harnack as hk
+from harnack.backend import choose_backend
+from harnack.fields import tape_evaluator
+from harnack.fields.batched_fields import FieldCache
+from harnack.tape.cells import TapeCells
+from harnack.tape.pruning import BoxLimits, BoxTapes
+from harnack.tape.recording import Tape, record
+from tests.tape.random_models import random_model
+
+
+def values_of(tape: Tape, lists: BoxTapes, index: int, p: Any) -> Any:
+    """The values of a list of instructions at points (n, 3), computed by NumPy."""
+    results: dict[int, Any] = {}
+    entries = range(int(lists.starts[index]), int(lists.starts[index + 1]))
+    for entry in entries:
+        instruction = int(lists.instructions[entry])
+        kind = int(tape.kinds[instruction])
+        if kind < 0:
+            results[entry] = p[:, instruction]
+            continue
+        operation = tape.operations[kind]
+        operands = [results[int(k)] for k in lists.operands[: operation.operand_count, entry]]
+        constants = tape.constants[instruction, : operation.constant_count].tolist()
+        results[entry] = operation.apply(operands, constants) + 0.0 * p[:, 0]
+    return results[entries[-1]]
+
+
+FORMULAS: dict[str, Any] = {
+    "itself": lambda x, y, z: hk.math.maximum(x, x) + hk.math.minimum(y, y) * z,
+    "coordinate": lambda x, y, z: hk.math.maximum(x, hk.math.minimum(y - 50.0, z - 90.0)),
+    "constant": lambda x, y, z: hk.math.maximum(x - 70.0, 0.25),
+    "powers": lambda x, y, z: x**3 - (y - 1) ** 2 / (z**2 + 3) + (x * x + 2) ** 0.5,
+    "functions": lambda x, y, z: (
+        hk.math.sin(3 * x) * hk.math.exp(-y * y) + hk.math.tanh(z) / (2 + hk.math.cos(x * y))
+        + abs(x - z) - hk.math.log(x**2 + 1.5) + hk.math.atan(y)
+    ),
+    "norms": lambda x, y, z: (
+        hk.math.sqrt(x * x + 4 * y * y + z * z) - hk.math.norm(x, y, p=4.0) + hk.math.norm(x, 2.0)
+    ),
+    "sums": lambda x, y, z: (x + y + z - 0.1) + (x - y) * 0.3 + (x + 0.2) + x * 2.0 - z / 3.0,
+    "nested": lambda x, y, z: hk.math.minimum(
+        hk.math.maximum(abs(x) - 0.5, -abs(y) + 0.2), hk.math.maximum(x - y, y - x) - z
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_lists_of_boxes_have_the_values_of_the_formula(name: str) -> None:
+    formula = FORMULAS[name]
+    tape, rng = record(formula), np.random.default_rng(0)
+    whole = BoxTapes.whole(tape)
+    p = rng.uniform(-1, 1, (200, 3))
+    np.testing.assert_allclose(
+        values_of(tape, whole, 0, p), formula(*p.T) + 0.0 * p[:, 0], rtol=1e-12, atol=1e-12
+    )
+    lower = rng.uniform(-1, 0.8, (40, 3))
+    upper = lower + rng.uniform(0.001, 0.5, (40, 1))
+    pruned = whole.subset(np.zeros(40, np.int64)).pruned(lower, upper, BoxLimits.unlimited(40, ()))
+    for k in range(40):
+        inside = rng.uniform(lower[k], upper[k], (20, 3))
+        exact = formula(*inside.T) + 0.0 * inside[:, 0]
+        np.testing.assert_allclose(
+            values_of(tape, pruned.lists, k, inside), exact, rtol=1e-12, atol=1e-12
+        )
+        assert (pruned.low[k] <= exact + 1e-12).all()
+        assert (pruned.high[k] >= exact - 1e-12).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("levels", [(), (0.0,), (-0.05, 0.1)])
+def test_cells_have_the_values_that_matter(seed: int, levels: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    model = random_model(rng, 40, 0.3)
+    tape = record(model.formula)
+    cells = TapeCells.of(tape, np.full(3, -1.5), np.full(3, 1.5), levels)
+    whole = BoxTapes.whole(tape)
+    p = rng.uniform(-1.5, 1.5, (300, 3))
+    x, y, z = np.floor((p - cells.origin) / cells.cell_size).astype(np.int64).T
+    index = x + cells.shape[0] * (y + cells.shape[1] * z)
+    is_empty = cells.empty_distance[index] > 0
+    exact = values_of(tape, whole, 0, p)
+    for k, (at, cell) in enumerate(zip(p, index, strict=True)):
+        which = int(cells.list_of_cell[cell])
+        (value,) = values_of(tape, cells.lists, which, at[None])
+        low, high = cells.limits.floor[which], cells.limits.cap[which]
+        if low <= exact[k] <= high:
+            assert value == pytest.approx(exact[k], abs=1e-12)
+        else:
+            assert value < low if exact[k] < low else value > high
+        if is_empty[k]:
+            assert not any(abs(exact[k] - level) < 1e-12 for level in levels)
+    assert levels or not is_empty.any()
+    lengths = cells.lists.lengths[cells.list_of_cell]
+    assert lengths.mean() < 0.4 * len(tape)
+
+
+def fresh_caches(monkeypatch: pytest.MonkeyPatch, shortest: int) -> None:
+    """Let formulas of more than `shortest` instructions be interpreted, of all fields."""
+    monkeypatch.setattr(tape_evaluator, "_MIN_INSTRUCTIONS", shortest)
+    for name in ("_TAPES", "_CELLS"):
+        monkeypatch.setattr(tape_evaluator, name, FieldCache())
+
+
+def camera_rays(count: int) -> tuple[Any, Any]:
+    """Rays (count^2, 3) from the directions of a cube's diagonal, over a box of the size 3."""
+    rng = np.random.default_rng(7)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    u, v = np.meshgrid(np.linspace(-1.7, 1.7, count), np.linspace(-1.7, 1.7, count))
+    o = np.stack([u.ravel(), v.ravel(), np.full(count * count, 4.0)], axis=1)
+    return o @ turn.T, np.tile(turn @ np.array([0.0, 0.0, -1.0]), (count * count, 1))
+
+
+@pytest.mark.parametrize(
+    ("seed", "count", "precision"),
+    [(0, 7, "single"), pytest.param(1, 12, "double", marks=pytest.mark.slow)],
+)
+def test_first_hits_are_those_of_the_compiled_formula(
+    monkeypatch: pytest.MonkeyPatch, seed: int, count: int, precision: Any
+) -> None:
+    o, d = camera_rays(60)
+    hits: list[Any] = []
+    for shortest in (10, 10**9):
+        fresh_caches(monkeypatch, shortest)
+        model = random_model(np.random.default_rng(seed), count)
+        evaluator = model.evaluator(choose_backend(precision))
+        assert isinstance(evaluator, tape_evaluator.TapeEvaluator) == (shortest == 10)
+        hits.append(hk.trace(model, o, d, precision=precision))
+    by_tape, compiled = hits
+    differs = by_tape.status != compiled.status
+    assert differs.mean() < 1e-3  # rays that touch within the tolerance
+    assert (compiled.status == hk.RayStatus.HIT).mean() > 0.1
+    both = ~differs & (compiled.status == hk.RayStatus.HIT)
+    # (A ray that touches within the tolerance may hit there, or farther on.)
+    later = by_tape.t[both] - compiled.t[both]
+    assert (later < 2e-3).all()
+    assert (later > -2e-3).mean() > 0.99
+    assert np.abs(model.value(by_tape.position[both])).max() < 1e-3
+    assert not (by_tape.status == hk.RayStatus.OUT_OF_STEPS).any()
+
+
+def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
+    """Radii, places, the number of parts and how they are combined are data."""
+    rng = np.random.default_rng(3)
+
+    def model(count: int) -> hk.Solid:
+        centers = rng.uniform(-1, 1, (count, 3))
+        return hk.solids.union(*(hk.Sphere(0.1, tuple(c)) for c in centers.tolist()))
+
+    o, d = camera_rays(20)
+    hk.trace(model(60), o, d)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        hk.trace(model(60), o, d)
+        hk.trace(model(300), o, d)
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+    assert kernels
+    assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
