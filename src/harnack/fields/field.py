@@ -85,6 +85,10 @@ _SOLID_METHODS = frozenset(
         "offset",
         "shell",
         "blended",
+        "repeated",
+        "mirrored",
+        "arranged",
+        "around",
     )
 )
 
@@ -171,7 +175,7 @@ class Field(Parametrized, abc.ABC):
                 "harnack.fields.Traits(...), such as Traits(has_creases=True)"
             )
         if not traits.has_parameter_derivatives:
-            check_no_derivatives(cls.__name__, args, kwargs)
+            check_no_derivatives(cls.__name__, *_unchecked_values((*args, *kwargs.values())))
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
@@ -399,6 +403,28 @@ class Field(Parametrized, abc.ABC):
         The default is empty.
         """
         return {}
+
+
+def is_checked(value: Any) -> bool:
+    """Whether a value is a field of the library that refused derivatives when it was made, so that
+    it need not be searched for them again."""
+    return (
+        isinstance(value, Field)
+        and not value.traits.has_parameter_derivatives
+        and type(value).__module__.startswith("harnack.")
+    )
+
+
+def _unchecked_values(arguments: tuple[Any, ...]) -> list[Any]:
+    """The arguments of a constructor in which derivatives may be: without fields, and without fields
+    in a tuple, that have been checked when they were made."""
+    values: list[Any] = []
+    for argument in arguments:
+        if type(argument) is tuple:
+            values += [value for value in cast("Any", argument) if not is_checked(value)]
+        elif not is_checked(argument):
+            values.append(argument)
+    return values
 
 
 def _attributes(field: Field) -> dict[str, Any]:
