@@ -17,6 +17,7 @@ from . import meshing as meshing
 from . import printing as printing
 from . import proofs as proofs
 from . import rendering as rendering
+from . import lattice as lattice
 from . import solids as solids
 from . import testing as testing
 from . import tracer as tracer
@@ -31,10 +32,11 @@ from .fields.solid_angles.dipole import DipolePotential
 from .fields.solid_angles.polygon_mesh import PolygonMesh
 from .fields.solid_angles.solid_angle import SolidAngle
 from .fields.solid_angles.winding_number import WindingNumber
-from .fields.solids.booleans import intersection, union
+from .fields.solids.booleans import intersection, smooth_union, union
 from .fields.solids.extrusions import Extrusion, SolidOfRevolution
 from .fields.solids.from_field import solid
-from .fields.solids.primitives import Capsule, Cuboid, Cylinder, Ellipsoid, Sphere, Torus
+from .fields.solids.primitives import Cuboid, Cylinder, Ellipsoid, Sphere, Torus
+from .fields.solids.round_cones import Capsule
 from .fields.solids.tube import Tube
 from .geometry import Ball, Box, HalfSpace
 from .live import Slider, page, read_scene, view, write_scene
@@ -87,6 +89,7 @@ __all__ = [
     "render",
     "repair",
     "signed_distance",
+    "smooth_union",
     "solid",
     "trace",
     "union",

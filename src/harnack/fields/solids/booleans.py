@@ -82,6 +82,37 @@ def intersection(*solids: Solid | Iterable[Solid]) -> Solid:
     return _combination(solids, is_union=False)
 
 
+def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) -> Solid:
+    """The union of solids with fillets where their surfaces meet. Of a single solid it is that
+    solid.
+
+    solids: a list, or any other iterable, of solids that have formulas.
+    radius: how far the fillets extend along the surfaces, where the functions are distances.
+    power: the exponent of the superellipse that a fillet is a part of (`Solid.blended`).
+
+    It is a balanced binary tree of blends of two: neighbors in the list are blended, then
+    neighbors among the results, and so on, so that no point passes more than log2(n) blends. The
+    order of the solids matters slightly: blending is not associative, so that near a point at
+    which three or more surfaces are within the radius, the fillet depends on which two are blended
+    first. Neighbors in space are best neighbors in the list.
+
+    Raises:
+        ValueError: no solids; radius or power out of range.
+        TypeError: an entry that is not a solid, or has no formula.
+    """
+    level = list(checked_solids(solids))
+    radius, power = _checked_blend(radius, power)
+    while len(level) > 1:
+        pairs = [level[k : k + 2] for k in range(0, len(level), 2)]
+        level = [
+            BlendedSolid((pair[0], pair[1]), radius, power, is_union=True)
+            if len(pair) == 2
+            else pair[0]
+            for pair in pairs
+        ]
+    return level[0]
+
+
 def checked_solids(solids: Iterable[Any]) -> tuple[Solid, ...]:
     """The solids of an iterable.
 
@@ -647,6 +678,20 @@ def _check_formula(solid: Solid) -> None:
         own_formula(solid)(*probe_jets())
 
 
+def _checked_blend(radius: Any, power: Any) -> tuple[float, float]:
+    """Radius and power of a blend as floats.
+
+    Raises:
+        ValueError: one of them is out of range.
+    """
+    for name, least, value in (("radius", 0.0, radius), ("power", 1.0, power)):
+        is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
+        if not is_valid or value == 0:
+            bound = "above 0" if least == 0.0 else f"of at least {least:g}"
+            raise ValueError(f"{name} must be a number {bound}, not {value!r}")
+    return float(radius), float(power)
+
+
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet where their surfaces meet. Its function
@@ -678,12 +723,9 @@ class BlendedSolid(FormulaSolid):
             ValueError: radius or power out of range.
             TypeError: a part that is not a solid, or has no formula.
         """
-        for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
-            is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
-            if not is_valid or value == 0:
-                bound = "above 0" if least == 0.0 else f"of at least {least:g}"
-                raise ValueError(f"{name} must be a number {bound}, not {value!r}")
-            object.__setattr__(self, name, float(value))
+        radius, power = _checked_blend(self.radius, self.power)
+        object.__setattr__(self, "radius", radius)
+        object.__setattr__(self, "power", power)
         for part in self.parts:
             if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(part))
