@@ -120,6 +120,8 @@ def checked_solids(solids: Iterable[Any]) -> tuple[Solid, ...]:
         ValueError: no solids.
         TypeError: it is no iterable, or an entry of it is not a solid.
     """
+    if isinstance(solids, Solid):
+        raise TypeError("give the solids as a list of them, such as smooth_union([a, b], radius)")
     if isinstance(solids, str | bytes) or not isinstance(solids, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(not_a_solid(solids))
     operands = tuple(solids)

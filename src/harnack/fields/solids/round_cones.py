@@ -142,10 +142,11 @@ class RoundCone(FormulaSolid):
     radii: tuple[float, float] = (0.5, 0.25)
     _frame: _Frame = dataclasses.field(init=False, repr=False, compare=False)
     _numbers: tuple[float, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    _is_ball: bool = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the arguments, and compute the frame, and the numbers r, L, s and s/c of the
-        formula.
+        """Check the arguments, and compute the frame, the numbers r, L, s and s/c of the formula, and
+        whether one ball contains the other.
 
         Raises:
             ValueError: not two positive radii.
@@ -160,19 +161,23 @@ class RoundCone(FormulaSolid):
             centers, (large, small) = (end, start), (small, large)
         axis = [b - a for a, b in zip(*centers, strict=True)]
         length, difference = math.hypot(*axis), large - small
+        is_ball = length <= difference or length == 0.0
         slope, ratio = 0.0, 0.0
-        if length <= difference or length == 0.0:  # one ball contains the other
-            axis, length = [0.0, 0.0, 1.0], 0.0
+        if is_ball:
+            axis = [0.0, 0.0, 1.0]
         else:
             slope = difference / length
             # s/c, with a product that loses no digits where both lengths are nearly equal.
             ratio = difference / math.sqrt((length - difference) * (length + difference))
         set_frozen(self, "_frame", _axial_frame(centers[0], axis))
         set_frozen(self, "_numbers", (large, length, slope, ratio))
+        set_frozen(self, "_is_ball", is_ball)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         along, across, other = _local_coordinates(self._frame, x, y, z)
         radius, length, slope, ratio = self._numbers
+        if self._is_ball:
+            return norm(along, across, other) - radius
         from_axis = norm(across, other)
         t = minimum(maximum(along - from_axis * ratio, 0.0), length)
         return norm(from_axis, along - t) + t * slope - radius
