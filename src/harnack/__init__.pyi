@@ -10,6 +10,7 @@ from . import gallery as gallery
 from . import geometry as geometry
 from . import io as io
 from . import kernels as kernels
+from . import lattice as lattice
 from . import literature as literature
 from . import live as live
 from . import math as math
@@ -17,7 +18,6 @@ from . import meshing as meshing
 from . import printing as printing
 from . import proofs as proofs
 from . import rendering as rendering
-from . import lattice as lattice
 from . import solids as solids
 from . import testing as testing
 from . import tracer as tracer

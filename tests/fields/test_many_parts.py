@@ -173,7 +173,7 @@ def test_what_a_smooth_union_refuses(arguments: Any, error: Any, text: str) -> N
 def test_round_cones_have_the_distance_from_the_nearest_point(end: Any, radii: Any) -> None:
     start = (-0.2, 0.1, 0.0)
     solid = hk.solids.RoundCone(start, end, radii)
-    x = np.concatenate([POINTS[:60], np.linspace(start, end, 7) + [0.01, 0.02, 0.03]])
+    x = np.concatenate([POINTS[:60], np.linspace(start, end, 7) + np.array([0.01, 0.02, 0.03])])
     expected = hull_by_search(x, np.array(start), np.array(end), *radii)
     value = solid.value(x, precision="double")
     assert (value > 0).any()
@@ -215,7 +215,10 @@ def test_struts_are_the_hulls_of_their_balls() -> None:
     expected = np.full(60, np.inf)
     x = POINTS[:60]
     for a, b in EDGES:
-        axis, r = NODES[a] + t[:, None] * (NODES[b] - NODES[a]), radii[a] + t * (radii[b] - radii[a])
+        axis, r = (
+            NODES[a] + t[:, None] * (NODES[b] - NODES[a]),
+            radii[a] + t * (radii[b] - radii[a]),
+        )
         distance = np.linalg.norm(x[:, None] - axis, axis=-1) - r
         expected = np.minimum(expected, distance.min(axis=1))
     np.testing.assert_allclose(solid.value(x, precision="double"), expected, rtol=0, atol=1e-7)
@@ -283,8 +286,8 @@ def test_lattices_are_the_graphs_they_are_named_after(name: str) -> None:
     assert lattice.coordination.min() >= 1
     # Moved by a period, the interior is the same graph.
     middles = {tuple(m) for m in (0.5 * (start + end)).round(6) + 0.0}
-    inner = 0.5 * (start + end)
-    moved = (inner + [0.7, 0, 0])[(np.abs(inner + [0.7, 0, 0]) < half - 0.36).all(axis=1)]
+    inner, step = 0.5 * (start + end), np.array([0.7, 0, 0])
+    moved = (inner + step)[(np.abs(inner + step) < half - 0.36).all(axis=1)]
     assert {tuple(m) for m in moved.round(6) + 0.0} <= middles
     assert len(moved) > 20
 
@@ -356,7 +359,7 @@ def test_what_lattices_refuse(make: Any, error: Any, text: str) -> None:
 
 def test_copies_are_where_they_are_put() -> None:
     shape = hk.Sphere(0.2, (0.5, 0.1, 0.0))
-    center = np.array([0.5, 0.1, 0.0])
+    center, x, y, z = np.array([0.5, 0.1, 0.0]), *np.eye(3)
     turn = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3]])
     oblique = np.array([[0.4, 0, 0], [0.1, 0.5, 0], [0, 0.2, 0.3]])
     angles = 2 * np.pi * np.arange(5) / 5
@@ -365,14 +368,14 @@ def test_copies_are_where_they_are_put() -> None:
         (shape.arranged(NODES), center + NODES),
         (shape.arranged([turn, turn]), [turn[:, :3] @ center + turn[:, 3]] * 2),
         (shape.arranged([square]), [turn[:, :3] @ center + turn[:, 3]]),
-        (shape.repeated(0.4, (3, 1, 1)), [center + [0.4 * k, 0, 0] for k in range(3)]),
+        (shape.repeated(0.4, (3, 1, 1)), [center + 0.4 * k * x for k in range(3)]),
         (shape.repeated((0.4, 0.5, 1), (2, 2, 1)),
-         [center + [0.4 * i, 0.5 * j, 0] for i, j in itertools.product(range(2), repeat=2)]),
+         [center + 0.4 * i * x + 0.5 * j * y for i, j in itertools.product(range(2), repeat=2)]),
         (shape.repeated(oblique, (1, 2, 2)),
          [center + i * oblique[1] + j * oblique[2]
           for i, j in itertools.product(range(2), repeat=2)]),
         (shape.mirrored(), [center, center * [-1, 1, 1]]),
-        (shape.mirrored("z", 0.4), [center, center + [0, 0, 0.8]]),
+        (shape.mirrored("z", 0.4), [center, center + 0.8 * z]),
         (shape.mirrored((3, 4, 0), 0.1),
          [center, center - 2 * (center @ [0.6, 0.8, 0] - 0.1) * np.array([0.6, 0.8, 0])]),
         (shape.around(5), [[0.5 * math.cos(a) - 0.1 * math.sin(a),
@@ -438,7 +441,7 @@ def test_only_solids_have_patterns() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_first_hits_of_a_lattice(precision: Any) -> None:
-    """Of 384 struts: no ray passes a place that is inside before its hit; hits are on the surface."""
+    """Of 384 struts: no ray passes what is inside before its hit; hits are on the surface."""
     lattice = hk.lattice.bcc(0.5, (4, 4, 3))
     rng, n = np.random.default_rng(3), 200
     o = rng.normal(size=(n, 3))

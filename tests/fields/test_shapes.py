@@ -67,8 +67,8 @@ def region(x: Any, loops: Any) -> Any:
 
 
 def hull_of_balls(x: Any, centers: Any, radii: Any) -> Any:
-    """The signed distance: the greatest of n . x less the support function over unit vectors n. It is
-    attained at the direction from one of the centers, or at one of those n that support both."""
+    """The signed distance: the greatest of n . x less the support function over unit vectors n. It
+    is attained at the direction from one of the centers, or at one of those n that support both."""
     (a, b), (r, s) = np.array(centers, float), radii
     axis, length = b - a, np.linalg.norm(b - a)
     normals = [(x - center) / np.maximum(norm(x - center), 1e-300)[..., None] for center in (a, b)]
@@ -77,7 +77,9 @@ def hull_of_balls(x: Any, centers: Any, radii: Any) -> Any:
         across = (x - a) - ((x - a) @ along)[..., None] * along
         size = norm(across)[..., None]
         any_across = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-        across = np.where(size > 0, across / np.maximum(size, 1e-300), any_across / norm(any_across))
+        across = np.where(
+            size > 0, across / np.maximum(size, 1e-300), any_across / norm(any_across)
+        )
         slope = (r - s) / length
         normals.append(slope * along + math.sqrt(1 - slope**2) * across)
     return np.max(

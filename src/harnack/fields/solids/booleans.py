@@ -100,7 +100,7 @@ def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) 
         ValueError: no solids; radius or power out of range.
         TypeError: an entry that is not a solid, or has no formula.
     """
-    level = list(checked_solids(solids))
+    level: list[Solid] = [*checked_solids(solids)]
     radius, power = _checked_blend(radius, power)
     while len(level) > 1:
         pairs = [level[k : k + 2] for k in range(0, len(level), 2)]
@@ -145,7 +145,8 @@ def _combination(solids: tuple[Any, ...], *, is_union: bool) -> BooleanSolid:
         TypeError: an argument that is not a solid.
     """
     is_list = len(solids) == 1 and not isinstance(solids[0], Field)
-    operands = checked_solids(solids[0] if is_list else solids)
+    arguments: Any = solids[0] if is_list else solids
+    operands = checked_solids(arguments)
     parts: list[Solid] = []
     for operand in operands:
         if isinstance(operand, BooleanSolid) and operand.is_union == is_union:
@@ -154,7 +155,9 @@ def _combination(solids: tuple[Any, ...], *, is_union: bool) -> BooleanSolid:
             parts.append(operand)
     is_extended = len(parts) > len(operands)
     if is_extended and all(is_checked(a) and a.domain is None for a in operands):
-        return BooleanSolid._joined(operands, tuple(parts), is_union)
+        return BooleanSolid._joined(  # pyright: ignore[reportPrivateUsage]
+            operands, tuple(parts), is_union
+        )
     return BooleanSolid(tuple(parts), is_union)
 
 

@@ -1,6 +1,6 @@
-"""Lattices of struts: periodic graphs in space, of nodes and edges, from which `Lattice.struts` makes
-a solid. Nodes have integer coordinates in fractions of a cell, so that neighboring cells share
-theirs exactly, and no edge is there twice."""
+"""Lattices of struts: periodic graphs in space, of nodes and edges, from which `Lattice.struts`
+makes a solid. Nodes have integer coordinates in fractions of a cell, so that neighboring cells
+share theirs exactly, and no edge is there twice."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class _UnitCell:
     """A cubic cell of a periodic graph.
 
     divisions: the number of parts of a side; coordinates are whole numbers of these.
-    bonds: pairs of a node in the cell and of the steps to its neighbor, each edge of the graph once.
+    bonds: pairs of a node in the cell and the steps to its neighbor, each edge of the graph once.
     """
 
     divisions: int
@@ -162,15 +162,14 @@ class _UnitCell:
 
     def _edges_of_block(self, counts: IntArray) -> IntArray:
         """The edges of a block of cells: the coordinates (m, 2, 3) of their ends, both in the block
-        or on its border. Edges come along a Morton curve, so that neighbors in the list are near."""
+        or on its border. They come along a Morton curve, so that neighbors in the list are near."""
         last = self.divisions * counts
-        corners = self.divisions * np.stack(
-            np.meshgrid(*(np.arange(n + 1) for n in counts), indexing="ij"), axis=-1
-        ).reshape(-1, 3)
+        cells = np.indices(tuple(counts + 1)).reshape(3, -1).T
+        corners: IntArray = self.divisions * cells
         pieces: list[IntArray] = []
         for node, steps in self.bonds:
-            start = corners + node
-            ends = np.stack([start, start + steps], axis=1)
+            start: IntArray = corners + np.array(node)
+            ends: IntArray = np.stack([start, start + np.array(steps)], axis=1)
             pieces.append(ends[((ends >= 0) & (ends <= last)).all(axis=(1, 2))])
         edges = np.concatenate(pieces)
         return edges[np.argsort(_morton_codes(edges.sum(axis=1)), kind="stable")]
@@ -190,7 +189,8 @@ def _checked_sides(cell: Any) -> tuple[float, float, float]:
     """The sides of a cell, from one positive number or three."""
     name = "the cell of a lattice"
     if np.ndim(cell) == 0:
-        return (as_positive(cell, name),) * 3
+        side = as_positive(cell, name)
+        return side, side, side
     return as_triple(cell, name, all_positive=True)
 
 
@@ -209,7 +209,9 @@ def _bounds(region: Any) -> tuple[FloatArray, FloatArray]:
     volume = region.sublevel_extent(0.0) if isinstance(region, Solid) else region
     lower, upper = (np.full(3, -np.inf), np.full(3, np.inf)) if volume is None else volume.bounds()
     if not np.isfinite([lower, upper]).all():
-        raise ValueError(f"the region {region!r} of a lattice has no bounds: intersect it with a box")
+        raise ValueError(
+            f"the region {region!r} of a lattice has no bounds: intersect it with a box"
+        )
     return lower, upper
 
 
@@ -351,8 +353,8 @@ def kagome(
     *,
     region: Volume | Solid | None = None,
 ) -> Lattice:
-    """The three-dimensional kagome lattice, of tetrahedra that share corners (pyrochlore): its nodes
-    are the middles of the bonds of diamond. In the interior 6 edges meet at each node.
+    """The three-dimensional kagome lattice, of tetrahedra that share corners (pyrochlore): its
+    nodes are the middles of the bonds of diamond. In the interior 6 edges meet at each node.
 
     cell, counts, region: as for `cubic`, with the same errors.
     """

@@ -1,5 +1,5 @@
-"""Patterns: unions of copies of a solid, in rows, around an axis, mirrored, or at given places. A copy
-is the image of the solid under an affine map."""
+"""Patterns: unions of copies of a solid, in rows, around an axis, mirrored, or at given places. A
+copy is the image of the solid under an affine map."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def maps_of(transforms: npt.ArrayLike) -> list[AffineMap]:
         raise ValueError(f"{name} are none: give at least one")
     check_finite(array.reshape(len(array), -1), "transform {}", ValueError, "it must be finite")
     if is_vectors:
-        return [AffineMap.translation(vector) for vector in array]
+        return [AffineMap.translation(vector) for vector in array.tolist()]
     return [AffineMap.of_matrix(matrix) for matrix in array]
 
 
@@ -67,7 +67,8 @@ def translations_of(period: Any, counts: Any) -> list[AffineMap]:
         if count > 1 and not vector.any():
             raise ValueError(f"period {k} is 0: {count} copies would be at the same place")
     steps = itertools.product(*(range(count) for count in numbers))
-    return [AffineMap.translation(np.array(step, np.float64) @ vectors) for step in steps]
+    offsets = np.array([*steps], np.float64) @ vectors
+    return [AffineMap.translation(offset) for offset in offsets.tolist()]
 
 
 def _period_vectors(period: Any) -> FloatArray:
@@ -113,7 +114,7 @@ def mirror_image(solid: Solid, normal: str | Sequence[float], offset: float) -> 
 
 
 def _unit_vector(normal: str | Sequence[float]) -> FloatArray:
-    """The unit vector along a coordinate axis "x", "y" or "z", or along a vector (3,) that is not 0.
+    """The unit vector along a coordinate axis "x", "y" or "z", or along a vector (3,), not 0.
 
     Raises:
         ValueError: another name, or no such vector.
@@ -141,5 +142,7 @@ def rotations_of(count: Any, axis: str | Sequence[float]) -> list[AffineMap]:
     except TypeError:
         number = 0
     if number < 1:
-        raise ValueError(f"the count of copies around an axis must be a positive integer, not {count!r}")
+        raise ValueError(
+            f"the count of copies around an axis must be a positive integer, not {count!r}"
+        )
     return [AffineMap.rotation(360.0 * k / number, axis) for k in range(number)]

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic import cos, maximum, minimum, norm, sin
+from harnack.arithmetic import cos, minimum, norm, sin
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend.validation import as_finite, as_positive, as_triple
 from harnack.fields.solids.solid import FormulaSolid, Point, ball_around, box_around, set_frozen

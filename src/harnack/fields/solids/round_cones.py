@@ -102,7 +102,7 @@ class Capsule(FormulaSolid):
         points are unbounded."""
         if above:
             return None
-        return _box_around_balls((self.start, self.end), (self.radius + level,) * 2)
+        return _box_around_balls((self.start, self.end), (self.radius + level, self.radius + level))
 
 
 @dataclass(frozen=True)
@@ -145,8 +145,8 @@ class RoundCone(FormulaSolid):
     _is_ball: bool = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the arguments, and compute the frame, the numbers r, L, s and s/c of the formula, and
-        whether one ball contains the other.
+        """Check the arguments, and compute the frame, the numbers r, L, s and s/c of the formula,
+        and whether one ball contains the other.
 
         Raises:
             ValueError: not two positive radii.

@@ -329,8 +329,8 @@ class Solid(Field):
 
         period: the vectors a, b and c: a number, for steps of this length along x, y and z; three
             numbers, the lengths of these steps; or three vectors (3, 3), a in the first row.
-        counts: how many copies there are along a, b and c; or a number for all three. (5, 1, 1) is a
-            row of five.
+        counts: how many copies there are along a, b and c; or a number for all three. (5, 1, 1) is
+            a row of five.
 
         Raises:
             ValueError: a period of another shape, not finite, or 0 where there are several copies;

@@ -1,5 +1,5 @@
-"""Struts: the solid around the edges of a graph in space, such as a lattice or a truss. It is a union
-of capsules or of round cones, one for each edge."""
+"""Struts: the solid around the edges of a graph in space, such as a lattice or a truss. It is a
+union of capsules or of round cones, one for each edge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from harnack.backend import FloatArray
-    from harnack.fields.solids.solid import Solid
+    from harnack.fields.solids.solid import Point, Solid
 
 
 def struts(
@@ -32,8 +32,8 @@ def struts(
     *,
     smooth: float | None = None,
 ) -> Solid:
-    """The solid around the edges of a graph: the union of all struts. A strut is a capsule or, where
-    the radii of its two nodes differ, a round cone (`RoundCone`).
+    """The solid around the edges of a graph: the union of all struts. A strut is a capsule or,
+    where the radii of its two nodes differ, a round cone (`RoundCone`).
 
     nodes: (n, 3) points.
     edges: (m, 2) indices of nodes, counted from 0.
@@ -55,8 +55,9 @@ def struts(
     check_coordinate_size(points, ValueError)
     pairs = checked_pairs(edges, points, ("edge", "node", "struts"))
     radii = _checked_node_radii(radius, len(points))
-    corners, sizes = [tuple(point) for point in points.tolist()], radii.tolist()
-    parts = [
+    corners: list[Point] = [(x, y, z) for x, y, z in points.tolist()]
+    sizes: list[float] = radii.tolist()
+    parts: list[Solid] = [
         Capsule(corners[a], corners[b], sizes[a])
         if sizes[a] == sizes[b]
         else RoundCone(corners[a], corners[b], (sizes[a], sizes[b]))
