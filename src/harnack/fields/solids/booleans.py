@@ -24,7 +24,7 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import as_finite
+from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
@@ -82,6 +82,7 @@ def intersection(*solids: Solid | Iterable[Solid]) -> Solid:
     return _combination(solids, is_union=False)
 
 
+@no_derivatives
 def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) -> Solid:
     """The union of solids with fillets where their surfaces meet. Of a single solid it is that
     solid.

@@ -19,6 +19,7 @@ from harnack.backend.validation import (
     check_coordinate_size,
     check_finite,
     check_vectors,
+    no_derivatives,
 )
 from harnack.fields.solids.patterns import checked_counts
 from harnack.fields.solids.solid import Solid
@@ -267,6 +268,7 @@ _DIAMOND = _UnitCell(4, _diamond_bonds())
 _KAGOME = _UnitCell(8, _kagome_bonds())
 
 
+@no_derivatives
 def cubic(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,
@@ -289,6 +291,7 @@ def cubic(
     return _CUBIC.lattice(cell, counts, region)
 
 
+@no_derivatives
 def bcc(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,
@@ -303,6 +306,7 @@ def bcc(
     return _BCC.lattice(cell, counts, region)
 
 
+@no_derivatives
 def fcc(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,
@@ -318,6 +322,7 @@ def fcc(
     return _FCC.lattice(cell, counts, region)
 
 
+@no_derivatives
 def octet(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,
@@ -333,6 +338,7 @@ def octet(
     return _OCTET.lattice(cell, counts, region)
 
 
+@no_derivatives
 def diamond(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,
@@ -347,6 +353,7 @@ def diamond(
     return _DIAMOND.lattice(cell, counts, region)
 
 
+@no_derivatives
 def kagome(
     cell: float | Sequence[float],
     counts: int | Sequence[int] | None = None,

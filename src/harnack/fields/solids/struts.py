@@ -13,6 +13,7 @@ from harnack.backend.validation import (
     check_coordinate_size,
     check_finite,
     check_vectors,
+    no_derivatives,
 )
 from harnack.fields.solids.booleans import smooth_union, union
 from harnack.fields.solids.round_cones import Capsule, RoundCone
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from harnack.fields.solids.solid import Point, Solid
 
 
+@no_derivatives
 def struts(
     nodes: npt.ArrayLike,
     edges: npt.ArrayLike,
@@ -55,13 +57,14 @@ def struts(
     check_coordinate_size(points, ValueError)
     pairs = checked_pairs(edges, points, ("edge", "node", "struts"))
     radii = _checked_node_radii(radius, len(points))
+    ends: list[list[int]] = pairs.tolist()
     corners: list[Point] = [(x, y, z) for x, y, z in points.tolist()]
     sizes: list[float] = radii.tolist()
     parts: list[Solid] = [
         Capsule(corners[a], corners[b], sizes[a])
         if sizes[a] == sizes[b]
         else RoundCone(corners[a], corners[b], (sizes[a], sizes[b]))
-        for a, b in pairs.tolist()
+        for a, b in ends
     ]
     return union(parts) if smooth is None else smooth_union(parts, smooth)
 
