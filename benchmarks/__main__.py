@@ -28,6 +28,7 @@ from .hollow import hollow
 from .inclusion import inclusion
 from .laplacian import laplacian
 from .live import live
+from .many_parts import many_parts
 from .meshes import meshes
 from .pictures import pictures
 from .povray import compare_with_povray, has_povray
@@ -41,7 +42,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster", "curves", "hollow",
+    "pictures", "live", "cluster", "curves", "hollow", "parts",
 )  # fmt: skip
 
 
@@ -101,6 +102,7 @@ def main() -> None:
         "formulas": formulas,
         "live": live,
         "meshes": meshes,
+        "parts": many_parts,
         "pictures": pictures,
         "repair": lambda: repair(arguments.meshes),
         "povray": compare_with_povray,

@@ -85,6 +85,7 @@ CONTENTS = {
         "docs/own-field",
         "docs/meshes",
         "docs/implicit",
+        "docs/many-parts",
         "docs/printing",
         "docs/live",
         "docs/frameworks",

@@ -22,8 +22,8 @@ from harnack.name_suggestions import did_you_mean
 _import, _, _names = cast("Any", lazy_loader).attach_stub(__name__, __file__)
 _NAMESPACES = (
     "arithmetic", "distance", "enclosures", "fields", "files", "gallery", "geometry", "io",
-    "kernels", "literature", "live", "math", "meshing", "printing", "proofs", "rendering",
-    "solids", "testing", "tracer",
+    "kernels", "lattice", "literature", "live", "math", "meshing", "printing", "proofs",
+    "rendering", "solids", "testing", "tracer",
 )  # fmt: skip
 __all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
     name for name in _names if name not in (*_NAMESPACES, "backend")

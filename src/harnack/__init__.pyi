@@ -10,6 +10,7 @@ from . import gallery as gallery
 from . import geometry as geometry
 from . import io as io
 from . import kernels as kernels
+from . import lattice as lattice
 from . import literature as literature
 from . import live as live
 from . import math as math
@@ -31,10 +32,11 @@ from .fields.solid_angles.dipole import DipolePotential
 from .fields.solid_angles.polygon_mesh import PolygonMesh
 from .fields.solid_angles.solid_angle import SolidAngle
 from .fields.solid_angles.winding_number import WindingNumber
-from .fields.solids.booleans import intersection, union
+from .fields.solids.booleans import intersection, smooth_union, union
 from .fields.solids.extrusions import Extrusion, SolidOfRevolution
 from .fields.solids.from_field import solid
-from .fields.solids.primitives import Capsule, Cuboid, Cylinder, Ellipsoid, Sphere, Torus
+from .fields.solids.primitives import Cuboid, Cylinder, Ellipsoid, Sphere, Torus
+from .fields.solids.round_cones import Capsule
 from .fields.solids.tube import Tube
 from .geometry import Ball, Box, HalfSpace
 from .live import Slider, page, read_scene, view, write_scene
@@ -87,6 +89,7 @@ __all__ = [
     "render",
     "repair",
     "signed_distance",
+    "smooth_union",
     "solid",
     "trace",
     "union",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from harnack.fields.solids.booleans import intersection, union
+from harnack.fields.solids.booleans import intersection, smooth_union, union
 from harnack.fields.solids.extrusions import Extrusion, SolidOfRevolution
 from harnack.fields.solids.fractal import DisplacedSolid, FractalNoise, Noise
 from harnack.fields.solids.from_field import solid
 from harnack.fields.solids.julia import Julia
 from harnack.fields.solids.primitives import (
-    Capsule,
     Cuboid,
     Cylinder,
     DoubleCone,
@@ -19,7 +18,9 @@ from harnack.fields.solids.primitives import (
     Supertorus,
     Torus,
 )
+from harnack.fields.solids.round_cones import Capsule, RoundCone
 from harnack.fields.solids.solid import FormulaSolid, Solid
+from harnack.fields.solids.struts import struts
 from harnack.fields.solids.thread import Thread, metric_thread
 from harnack.fields.solids.tube import Tube, TubeNetwork
 
@@ -36,6 +37,7 @@ __all__ = [
     "Julia",
     "Noise",
     "Plane",
+    "RoundCone",
     "Solid",
     "SolidOfRevolution",
     "Sphere",
@@ -47,6 +49,8 @@ __all__ = [
     "TubeNetwork",
     "intersection",
     "metric_thread",
+    "smooth_union",
     "solid",
+    "struts",
     "union",
 ]

@@ -80,6 +80,8 @@ _CASES: dict[str, _Case] = {
                     ("angle", 40.0, {"angle": 40.0})),
     "capsule": (hk.Capsule, {"start": (0, 0, 0), "end": (1, 0, 0)}, {"start", "end", "radius"},
                 ("end", (0, 1, 0), {"end": (0, 1, 0)})),
+    "round cone": (hk.solids.RoundCone, {"radii": (0.4, 0.2)}, {"start", "end", "radii"},
+                   ("radii", np.array([0.1, 0.2]), {"radii": (0.1, 0.2)})),
     "torus": (hk.Torus, {"major": 0.9}, {"major", "minor"}, ("minor", 0.3, {"minor": 0.3})),
     "cuboid": (hk.Cuboid, {"sides": (2, 1, 1)}, {"sides", "radius"},
                ("radius", 0.3, {"radius": 0.3})),

@@ -66,6 +66,27 @@ def region(x: Any, loops: Any) -> Any:
     return np.where(inside, -best, best)
 
 
+def hull_of_balls(x: Any, centers: Any, radii: Any) -> Any:
+    """The signed distance: the greatest of n . x less the support function over unit vectors n. It
+    is attained at the direction from one of the centers, or at one of those n that support both."""
+    (a, b), (r, s) = np.array(centers, float), radii
+    axis, length = b - a, np.linalg.norm(b - a)
+    normals = [(x - center) / np.maximum(norm(x - center), 1e-300)[..., None] for center in (a, b)]
+    if abs(r - s) < length:
+        along = axis / length
+        across = (x - a) - ((x - a) @ along)[..., None] * along
+        size = norm(across)[..., None]
+        any_across = np.cross(along, np.eye(3)[np.abs(along).argmin()])
+        across = np.where(
+            size > 0, across / np.maximum(size, 1e-300), any_across / norm(any_across)
+        )
+        slope = (r - s) / length
+        normals.append(slope * along + math.sqrt(1 - slope**2) * across)
+    return np.max(
+        [np.minimum(((x - a) * n).sum(-1) - r, ((x - b) * n).sum(-1) - s) for n in normals], axis=0
+    )
+
+
 def extruded(x: Any, loops: Any, height: float, twist: float = 0.0, taper: float = 1.0) -> Any:
     z = x[..., 2]
     share = np.clip(z / height, 0, 1)
@@ -183,6 +204,14 @@ SHAPES: dict[str, tuple[Any, Oracle]] = {
     "capsule": (
         hk.Capsule((0.2, 0.0, 0.0), (1.0, 0.5, -0.3), 0.3),
         lambda x: segments(x, np.array([[0.2, 0.0, 0.0], [1.0, 0.5, -0.3]])) - 0.3,
+    ),
+    "round cone": (
+        hk.solids.RoundCone((0.2, 0.0, 0.0), (0.8, 0.5, -0.3), (0.2, 0.5)),
+        lambda x: hull_of_balls(x, [[0.2, 0.0, 0.0], [0.8, 0.5, -0.3]], (0.2, 0.5)),
+    ),
+    "ball in a ball": (
+        hk.solids.RoundCone((0.2, 0.0, 0.0), (0.1, 0.1, -0.3), (0.7, 0.3)),
+        lambda x: norm(x - [0.2, 0.0, 0.0]) - 0.7,
     ),
     "torus": (hk.Torus(0.9, 0.3), lambda x: pair(norm(x[..., :2]) - 0.9, x[..., 2]) - 0.3),
     "box": (hk.Cuboid((2.0, 1.0, 1.4)), lambda x: box(x, [1.0, 0.5, 0.7])),

@@ -15,7 +15,7 @@ import copyreg
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast, get_origin
 
@@ -85,6 +85,10 @@ _SOLID_METHODS = frozenset(
         "offset",
         "shell",
         "blended",
+        "repeated",
+        "mirrored",
+        "arranged",
+        "around",
     )
 )
 
@@ -171,7 +175,9 @@ class Field(Parametrized, abc.ABC):
                 "harnack.fields.Traits(...), such as Traits(has_creases=True)"
             )
         if not traits.has_parameter_derivatives:
-            check_no_derivatives(cls.__name__, args, kwargs)
+            # What was checked when it was made is not searched again.
+            values = _values_without((*args, *kwargs.values()), is_checked)
+            check_no_derivatives(cls.__name__, *values)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
@@ -230,7 +236,8 @@ class Field(Parametrized, abc.ABC):
             attributes |= record or {}
         for name, value in attributes.items():
             object.__setattr__(self, name, value)
-        make_read_only(attributes)
+        # Fields in it have been restored already, by this method.
+        make_read_only(_values_without(attributes.values(), lambda value: isinstance(value, Field)))
 
     def __repr__(self) -> str:
         """The constructor call as text, with those arguments that the field still stores as
@@ -399,6 +406,25 @@ class Field(Parametrized, abc.ABC):
         The default is empty.
         """
         return {}
+
+
+def is_checked(value: Any) -> bool:
+    """Whether a value is a field of the library that refused derivatives when it was made, so that
+    it need not be searched for them again."""
+    return (
+        isinstance(value, Field)
+        and not value.traits.has_parameter_derivatives
+        and type(value).__module__.startswith("harnack.")
+    )
+
+
+def _values_without(values: Iterable[Any], is_left_out: Callable[[Any], bool]) -> list[Any]:
+    """The values, and in place of tuples what is in them, without those that are left out."""
+    kept: list[Any] = []
+    for value in values:
+        entries = cast("tuple[Any, ...]", value if type(value) is tuple else (value,))
+        kept += [entry for entry in entries if not is_left_out(entry)]
+    return kept
 
 
 def _attributes(field: Field) -> dict[str, Any]:

@@ -24,7 +24,8 @@ from harnack.fields.solids.booleans import union
 from harnack.fields.solids.fractal import DisplacedSolid, FractalNoise
 from harnack.fields.solids.from_field import solid
 from harnack.fields.solids.julia import Julia
-from harnack.fields.solids.primitives import Sphere, Torus
+from harnack.fields.solids.lattices import octet
+from harnack.fields.solids.primitives import Cylinder, Sphere, Torus
 from harnack.fields.solids.tube import Tube
 from harnack.files import Atoms
 from harnack.gallery.scene import Scene
@@ -201,6 +202,12 @@ def _lattice() -> list[Surface]:
     return _drawn(solid(Gyroid(0.5), between=(-0.4, 0.4)) & Torus(0.8, 0.4))
 
 
+def _octet() -> list[Surface]:
+    """Return a cylinder of an octet truss, its struts blended at the nodes."""
+    cylinder = Cylinder(1.0, 1.2)
+    return _drawn(octet(0.6, region=cylinder).struts(0.045, smooth=0.03) & cylinder)
+
+
 def _knot() -> list[Surface]:
     """Return a thick Seifert surface of the trefoil knot, and a tube around the knot itself."""
     curve: FloatArray = example_curves.torus_knot(2, 3, 120)
@@ -252,6 +259,14 @@ SHAPES = (
         ("copper",),
         Camera(elevation=38),
         demo_spp=25,
+    ),
+    Scene(
+        "octet-lattice",
+        "an octet truss of blended struts, cut to a cylinder",
+        _octet,
+        ("silver",),
+        Camera(elevation=32),
+        show="shaded",
     ),
     Scene(
         "knot-tube",

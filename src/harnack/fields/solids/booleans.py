@@ -24,13 +24,15 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import as_finite
+from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.field import Field, is_checked
 from harnack.fields.formula import has_own_formula, on_backend, own_formula, probe_jets
+from harnack.fields.parameters import record_call
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
     FormulaSolid,
@@ -54,29 +56,88 @@ if TYPE_CHECKING:
 _MIN_SHIFT = 0.25
 
 
-def union(*solids: Solid) -> Solid:
+def union(*solids: Solid | Iterable[Solid]) -> Solid:
     """The union of solids: all points that are in at least one of them.
 
+    solids: any number of solids, each an argument, as in union(a, b, c); or one list, or any other
+        iterable, of all of them.
+
     Raises:
         ValueError: no solids.
         TypeError: an argument that is not a solid.
     """
-    return BooleanSolid(_flatten_operands(solids, is_union=True), is_union=True)
+    return _combination(solids, is_union=True)
 
 
-def intersection(*solids: Solid) -> Solid:
+def intersection(*solids: Solid | Iterable[Solid]) -> Solid:
     """The intersection of solids: all points that are in each of them.
 
+    solids: any number of solids, each an argument, as in intersection(a, b, c); or one list, or any
+        other iterable, of all of them.
+
     Raises:
         ValueError: no solids.
         TypeError: an argument that is not a solid.
     """
-    return BooleanSolid(_flatten_operands(solids, is_union=False), is_union=False)
+    return _combination(solids, is_union=False)
 
 
-def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Solid, ...]:
-    """The operands of a union (or intersection). An argument that is itself a union (or
-    intersection) is replaced by its own operands, so that combinations are not nested.
+@no_derivatives
+def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) -> Solid:
+    """The union of solids with fillets where their surfaces meet. Of a single solid it is that
+    solid.
+
+    solids: a list, or any other iterable, of solids that have formulas.
+    radius: how far the fillets extend along the surfaces, where the functions are distances.
+    power: the exponent of the superellipse that a fillet is a part of (`Solid.blended`).
+
+    It is a balanced binary tree of blends of two: neighbors in the list are blended, then
+    neighbors among the results, and so on, so that no point passes more than log2(n) blends. The
+    order of the solids matters slightly: blending is not associative, so that near a point at
+    which three or more surfaces are within the radius, the fillet depends on which two are blended
+    first. Neighbors in space are best neighbors in the list.
+
+    Raises:
+        ValueError: no solids; radius or power out of range.
+        TypeError: an entry that is not a solid, or has no formula.
+    """
+    level: list[Solid] = [*checked_solids(solids)]
+    radius, power = _checked_blend(radius, power)
+    while len(level) > 1:
+        pairs = [level[k : k + 2] for k in range(0, len(level), 2)]
+        level = [
+            BlendedSolid((pair[0], pair[1]), radius, power, is_union=True)
+            if len(pair) == 2
+            else pair[0]
+            for pair in pairs
+        ]
+    return level[0]
+
+
+def checked_solids(solids: Iterable[Any]) -> tuple[Solid, ...]:
+    """The solids of an iterable.
+
+    Raises:
+        ValueError: no solids.
+        TypeError: it is no iterable, or an entry of it is not a solid.
+    """
+    if isinstance(solids, Solid):
+        raise TypeError("give the solids as a list of them, such as smooth_union([a, b], radius)")
+    if isinstance(solids, str | bytes) or not isinstance(solids, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(not_a_solid(solids))
+    operands = tuple(solids)
+    if not operands:
+        raise ValueError("give at least one solid")
+    for operand in operands:
+        if not isinstance(operand, Solid):
+            raise TypeError(not_a_solid(operand))
+    return operands
+
+
+def _combination(solids: tuple[Any, ...], *, is_union: bool) -> BooleanSolid:
+    """The union (or intersection) of solids, from the arguments of `union`. An operand that is
+    itself a union (or intersection) is replaced by its own operands, so that combinations are not
+    nested.
 
     is_union: whether a union is made; otherwise an intersection.
 
@@ -84,17 +145,21 @@ def _flatten_operands(solids: tuple[Solid, ...], *, is_union: bool) -> tuple[Sol
         ValueError: no solids.
         TypeError: an argument that is not a solid.
     """
-    if not solids:
-        raise ValueError("give at least one solid")
-    flat: list[Solid] = []
-    for solid in solids:
-        if not isinstance(solid, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise TypeError(not_a_solid(solid))
-        if isinstance(solid, BooleanSolid) and solid.is_union == is_union:
-            flat.extend(solid.parts)
+    is_list = len(solids) == 1 and not isinstance(solids[0], Field)
+    arguments: Any = solids[0] if is_list else solids
+    operands = checked_solids(arguments)
+    parts: list[Solid] = []
+    for operand in operands:
+        if isinstance(operand, BooleanSolid) and operand.is_union == is_union:
+            parts.extend(operand.parts)
         else:
-            flat.append(solid)
-    return tuple(flat)
+            parts.append(operand)
+    is_extended = len(parts) > len(operands)
+    if is_extended and all(is_checked(a) and a.domain is None for a in operands):
+        return BooleanSolid._joined(  # pyright: ignore[reportPrivateUsage]
+            operands, tuple(parts), is_union
+        )
+    return BooleanSolid(tuple(parts), is_union)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,20 +190,44 @@ class BooleanSolid(Solid):
         if domains:
             domain = domains[0] if len(domains) == 1 else VolumeIntersection(domains)
         object.__setattr__(self, "domain", domain)
+        self._set_common_attributes(self.parts)
+
+    def _set_common_attributes(self, operands: Iterable[Solid]) -> None:
+        """Set the settings for the tracer and the Lipschitz constant, from those of the parts, or
+        from those of solids that are combinations of the same kind of the parts."""
+        solids = tuple(operands)
         # The smallest factor of all operands. A step longer than the proved one is accepted only if
         # every operand proves the rest of it, looking back from the new point. So one operand
         # without such proofs makes longer steps useless.
         traits = dataclasses.replace(
             self.traits,
-            over_relaxation=min(part.traits.over_relaxation for part in self.parts),
-            min_wavelength=min_wavelength(self.parts),
-            has_variable_accuracy=any(part.traits.has_variable_accuracy for part in self.parts),
+            over_relaxation=min(solid.traits.over_relaxation for solid in solids),
+            min_wavelength=min_wavelength(solids),
+            has_variable_accuracy=any(solid.traits.has_variable_accuracy for solid in solids),
         )
         object.__setattr__(self, "traits", traits)
-        constants = [part.lipschitz for part in self.parts]
+        constants = [solid.lipschitz for solid in solids]
         # The minimum or maximum of functions has the largest of their constants.
-        all_known = all(part is not None for part in constants)
+        all_known = all(constant is not None for constant in constants)
         object.__setattr__(self, "lipschitz", max(constants) if all_known else None)
+
+    @classmethod
+    def _joined(
+        cls, operands: tuple[Solid, ...], parts: tuple[Solid, ...], is_union: bool
+    ) -> BooleanSolid:
+        """The combination of solids, some of which are combinations of the same kind, whose parts
+        are not looked at again: so a loop that adds a solid to a union a thousand times takes a
+        time that grows with its length and not with its square.
+
+        operands: the solids, without domains, which have been checked (`is_checked`).
+        parts: the parts of those that are combinations of the same kind, and all others.
+        """
+        solid = object.__new__(cls)
+        object.__setattr__(solid, "parts", parts)
+        object.__setattr__(solid, "is_union", is_union)
+        record_call(solid, (parts, is_union), {})
+        solid._set_common_attributes(operands)
+        return solid
 
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return BooleanSolid(tuple(part.map_operands(change) for part in self.parts), self.is_union)
@@ -595,6 +684,20 @@ def _check_formula(solid: Solid) -> None:
         own_formula(solid)(*probe_jets())
 
 
+def _checked_blend(radius: Any, power: Any) -> tuple[float, float]:
+    """Radius and power of a blend as floats.
+
+    Raises:
+        ValueError: one of them is out of range.
+    """
+    for name, least, value in (("radius", 0.0, radius), ("power", 1.0, power)):
+        is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
+        if not is_valid or value == 0:
+            bound = "above 0" if least == 0.0 else f"of at least {least:g}"
+            raise ValueError(f"{name} must be a number {bound}, not {value!r}")
+    return float(radius), float(power)
+
+
 @dataclass(frozen=True, eq=False)
 class BlendedSolid(FormulaSolid):
     """The union or intersection of two solids with a fillet where their surfaces meet. Its function
@@ -626,12 +729,9 @@ class BlendedSolid(FormulaSolid):
             ValueError: radius or power out of range.
             TypeError: a part that is not a solid, or has no formula.
         """
-        for name, least, value in (("radius", 0.0, self.radius), ("power", 1.0, self.power)):
-            is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
-            if not is_valid or value == 0:
-                bound = "above 0" if least == 0.0 else f"of at least {least:g}"
-                raise ValueError(f"{name} must be a number {bound}, not {value!r}")
-            object.__setattr__(self, name, float(value))
+        radius, power = _checked_blend(self.radius, self.power)
+        object.__setattr__(self, "radius", radius)
+        object.__setattr__(self, "power", power)
         for part in self.parts:
             if not isinstance(part, Solid):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise TypeError(not_a_solid(part))

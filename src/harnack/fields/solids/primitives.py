@@ -1,4 +1,4 @@
-"""Primitive solids: plane, sphere, ellipsoid, cylinder, cone, capsule, torus, box, superquadrics. A
+"""Primitive solids: plane, sphere, ellipsoid, cylinder, cone, torus, box, superquadrics. A
 solid is the set of points where its function f is at most 0. The f of each shape is its signed
 distance, negative inside, or a bound of the distance (Hart 1996, appendix A). Where the Lipschitz
 constant of f is 1, f is no larger than the distance outside. All shapes have this constant but the
@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic import cos, maximum, minimum, norm, sin
+from harnack.arithmetic import cos, minimum, norm, sin
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend.validation import as_finite, as_positive, as_triple
 from harnack.fields.solids.solid import FormulaSolid, Point, ball_around, box_around, set_frozen
@@ -205,61 +205,6 @@ class DoubleCone(FormulaSolid):
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         del level, above
         return None
-
-
-@dataclass(frozen=True)
-class Capsule(FormulaSolid):
-    """The points within `radius` of the segment from `start` to `end`. f is the signed distance |q
-    - max(0, min(1, t)) (end - start)| - radius, where q = x - start, and t is the position of the
-    nearest point of the segment's line, as a fraction of the segment. As the distance from a set
-    minus a constant, f has the Lipschitz constant 1."""
-
-    is_convex = True
-
-    start: Point = (0.0, 0.0, -1.0)
-    end: Point = (0.0, 0.0, 1.0)
-    radius: float = 0.5
-
-    lipschitz = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the arguments.
-
-        Raises:
-            ValueError: start and end are the same point, or the radius is not positive.
-        """
-        start = as_triple(self.start, "the start of a capsule")
-        end = as_triple(self.end, "the end of a capsule")
-        if start == end:
-            raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
-        set_frozen(self, "start", start)
-        set_frozen(self, "end", end)
-        set_frozen(self, "radius", as_positive(self.radius, "the radius of a capsule"))
-
-    def formula(self, x: Any, y: Any, z: Any) -> Any:
-        """f at (x, y, z): the distance from the segment minus the radius. t is the position of the
-        nearest point of the segment's line, as a fraction of the segment."""
-        axis = [b - a for a, b in zip(self.start, self.end, strict=True)]
-        from_start = [v - a for v, a in zip((x, y, z), self.start, strict=True)]
-        square = axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]
-        t = (from_start[0] * axis[0] + from_start[1] * axis[1] + from_start[2] * axis[2]) / square
-        # The distance beyond the ends, along the axis; and the distance from the line, across it.
-        length = norm(*axis)
-        beyond = maximum(-t, t - 1.0, 0.0) * length
-        across = norm(*(v - t * a for v, a in zip(from_start, axis, strict=True)))
-        return norm(across, beyond) - self.radius
-
-    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
-        """A box that contains all points where f <= level: the box of the segment, grown by radius
-        and level on each side. None if `above` (a volume for all points where f >= level), as these
-        points are unbounded."""
-        if above:
-            return None
-        r = self.radius + level
-        pairs = list(zip(self.start, self.end, strict=True))
-        half = [abs(b - a) / 2 + r for a, b in pairs]
-        center = tuple((a + b) / 2 for a, b in pairs)
-        return box_around((half[0], half[1], half[2]), center)
 
 
 @dataclass(frozen=True)

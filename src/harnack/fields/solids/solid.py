@@ -305,6 +305,72 @@ class Solid(Field):
 
         return self._apply_map(Taper(start, end, axis))
 
+    # Patterns: unions of copies.
+
+    @no_derivatives
+    def arranged(self, transforms: npt.ArrayLike) -> Solid:
+        """The union of copies of the solid at given places. Copies may overlap.
+
+        transforms: (n, 3) translations; or (n, 3, 3), (n, 3, 4) or (n, 4, 4) matrices, as in
+            `transformed`. The solid itself is not among the copies unless a transform says so.
+
+        Raises:
+            ValueError: another shape, no transform, numbers that are not finite, or a singular
+                matrix.
+        """
+        from harnack.fields.solids.patterns import maps_of, union_of_images
+
+        return union_of_images(self, maps_of(transforms))
+
+    @no_derivatives
+    def repeated(self, period: npt.ArrayLike, counts: int | Sequence[int]) -> Solid:
+        """The union of copies of the solid in a row, a plane or a block: the solid itself, and
+        copies moved by i a + j b + k c for 0 <= i, j, k below the counts. Copies may overlap.
+
+        period: the vectors a, b and c: a number, for steps of this length along x, y and z; three
+            numbers, the lengths of these steps; or three vectors (3, 3), a in the first row.
+        counts: how many copies there are along a, b and c; or a number for all three. (5, 1, 1) is
+            a row of five.
+
+        Raises:
+            ValueError: a period of another shape, not finite, or 0 where there are several copies;
+                counts that are not positive integers.
+        """
+        from harnack.fields.solids.patterns import translations_of, union_of_images
+
+        return union_of_images(self, translations_of(period, counts))
+
+    @no_derivatives
+    def mirrored(self, normal: str | Sequence[float] = "x", offset: float = 0.0) -> Solid:
+        """The union of the solid and its mirror image. (The mirror image alone is
+        transformed(matrix) with the matrix of a reflection.)
+
+        normal: of the mirror: "x", "y", "z" or a vector (3,).
+        offset: the distance of the mirror from the origin, along the normal.
+
+        Raises:
+            ValueError: a normal that is 0, or an offset that is not finite.
+        """
+        from harnack.fields.solids.booleans import union
+        from harnack.fields.solids.patterns import mirror_image
+
+        return union(self, mirror_image(self, normal, offset))
+
+    @no_derivatives
+    def around(self, count: int, axis: str | Sequence[float] = "z") -> Solid:
+        """The union of copies of the solid at equal angles around an axis through the origin: the
+        solid itself, and copies rotated by multiples of 360/count degrees.
+
+        count: the number of copies, with the solid itself.
+        axis: "x", "y", "z" or a vector (3,).
+
+        Raises:
+            ValueError: a count that is not a positive integer, or a vector that is 0.
+        """
+        from harnack.fields.solids.patterns import rotations_of, union_of_images
+
+        return union_of_images(self, rotations_of(count, axis))
+
     def _apply_map(self, change: SpaceMap) -> Solid:
         """The image of the solid under a map of space. The map is applied to each operand of a
         combination of solids."""

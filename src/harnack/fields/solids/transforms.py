@@ -41,7 +41,7 @@ from harnack.fields.solids.solid import (
     formula_of,
     without_levels,
 )
-from harnack.geometry import Ball, ConvexHull
+from harnack.geometry import Ball, Box, ConvexHull
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
@@ -177,6 +177,12 @@ class AffineMap(SpaceMap, Parametrized):
         return TransformedSolid(solid, self)
 
     @property
+    def is_identity(self) -> bool:
+        """Whether the map leaves all points where they are."""
+        identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        return self.matrix == identity and not any(self.translation_vector)
+
+    @property
     def inverse(self) -> FloatArray:
         """The inverse of the matrix."""
         return np.linalg.inv(np.array(self.matrix))
@@ -189,8 +195,9 @@ class AffineMap(SpaceMap, Parametrized):
 
     def volume(self, volume: Volume | None) -> Volume | None:
         """A volume that contains the image of `volume` under the map: a ball for a ball and a
-        similarity, else the convex hull of the image of its box. None if `volume` is None or
-        unbounded. It is enlarged a little for rounding."""
+        similarity; else the image of its box, which is a box if the map takes coordinate axes to
+        such, and a convex hull if not. None if `volume` is None or unbounded. It is enlarged a
+        little for rounding."""
         if volume is None:
             return None
         m, b = np.array(self.matrix), np.array(self.translation_vector)
@@ -207,6 +214,9 @@ class AffineMap(SpaceMap, Parametrized):
         # The image of a box is the convex hull of the images of its corners.
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
         image = corners @ m.T + b
+        if ((m != 0).sum(axis=0) == 1).all():
+            slack = 1e-12 * float(np.abs(image).max())
+            return Box(tuple(image.min(axis=0) - slack), tuple(image.max(axis=0) + slack))
         return ConvexHull.from_points(image).padded(1e-12 * float(np.abs(image).max()))
 
 

@@ -608,7 +608,9 @@ class TubeNetwork(PatchField):
         self.points: FloatArray = np.array(array, dtype=np.float64)
         check_finite(self.points, "point {} of tubes", ValueError)
         check_coordinate_size(self.points, ValueError)
-        self.segments: IntArray = _checked_segments(segments, self.points)
+        self.segments: IntArray = checked_pairs(segments, self.points)
+        if len(self.segments) >= MAX_BOXES:
+            raise ValueError(f"{len(self.segments):,} segments are too many: at most {MAX_BOXES:,}")
         self.radius: FloatArray = _checked_radius(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
@@ -717,34 +719,35 @@ class _SegmentEvaluator(Evaluator):
         return Sample(distance - row[3], gradient, promises, error, gradient_error)
 
 
-def _checked_segments(segments: Any, points: FloatArray) -> IntArray:
-    """Check the segments, and return them as an array (m, 2) of indices of points.
+def checked_pairs(
+    pairs: Any, points: FloatArray, names: tuple[str, str, str] = ("segment", "point", "tubes")
+) -> IntArray:
+    """Check pairs of points, and return them as a read-only array (m, 2) of indices of points.
 
     points: (n, 3).
+    names: what a pair, a point, and the whole are called in messages.
 
     Raises:
-        ValueError: a wrong shape or type, too many segments, an index out of range, or a segment
-            without a length.
+        ValueError: a wrong shape or type, an index out of range, or a pair without a length.
     """
-    array = as_real_array(segments, "the segments of tubes")
+    pair, point, whole = names
+    array = as_real_array(pairs, f"the {pair}s of {whole}")
     if array.ndim != 2 or array.shape[1] != 2 or not len(array):
-        raise ValueError(f"the segments of tubes must have shape (m, 2), not {array.shape}")
+        raise ValueError(f"the {pair}s of {whole} must have shape (m, 2), not {array.shape}")
     if array.dtype.kind not in "iu":
-        raise ValueError(f"the segments of tubes must be integer indices, not {array.dtype}")
-    if len(array) >= MAX_BOXES:
-        raise ValueError(f"{len(array):,} segments are too many: at most {MAX_BOXES:,}")
-    pairs = np.array(array, dtype=np.int64)
+        raise ValueError(f"the {pair}s of {whole} must be integer indices, not {array.dtype}")
+    indices = np.array(array, dtype=np.int64)
     # Each index must be that of a point.
-    if (bad := np.flatnonzero(((pairs < 0) | (pairs >= len(points))).any(axis=1))).size:
+    if (bad := np.flatnonzero(((indices < 0) | (indices >= len(points))).any(axis=1))).size:
         raise ValueError(
-            f"segment {bad[0]} joins points {pairs[bad[0], 0]} and {pairs[bad[0], 1]}: there are "
-            f"{len(points):,} points, counted from 0"
+            f"{pair} {bad[0]} joins {point}s {indices[bad[0], 0]} and {indices[bad[0], 1]}: there "
+            f"are {len(points):,} {point}s, counted from 0"
         )
-    ends = points[pairs]
+    ends = points[indices]
     if (empty := np.flatnonzero(np.abs(ends[:, 0] - ends[:, 1]).max(axis=1) < 1e-100)).size:
-        raise ValueError(f"segment {empty[0]} has no length: leave it out")
-    pairs.setflags(write=False)
-    return pairs
+        raise ValueError(f"{pair} {empty[0]} has no length: leave it out")
+    indices.setflags(write=False)
+    return indices
 
 
 def _checked_radius(radius: Any, count: int) -> FloatArray:

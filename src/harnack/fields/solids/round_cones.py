@@ -1,0 +1,216 @@
+"""Segments with a thickness: capsules, and round cones, whose radius varies along the segment. Both
+are convex hulls of two balls, and their functions are the exact signed distances. Lattices and
+networks of struts are unions of many (`harnack.fields.solids.struts`). So their formulas have few
+operations: coordinates are taken along and across the axis, in a frame that is computed once."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from harnack.arithmetic import maximum, minimum, norm
+from harnack.backend.validation import as_positive, as_triple
+from harnack.fields.solids.solid import FormulaSolid, Point, box_around, set_frozen
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from harnack.geometry import Volume
+
+# Rows (a, b, c, d): a local coordinate is a x + b y + c z - d.
+_Frame: TypeAlias = tuple[tuple[float, float, float, float], ...]
+
+
+def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> _Frame:
+    """The frame of three local coordinates that are 0 at `origin`: the first is along the axis, the
+    other two are at right angles to it and to each other (Duff et al. 2017, "Building an
+    orthonormal basis, revisited").
+
+    axis: a vector (3,) of any length but 0.
+    """
+    length = math.hypot(*axis)
+    x, y, z = (entry / length for entry in axis)
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    rows = (x, y, z), (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+    o = origin
+    # Adding 0.0 makes -0.0 the number 0.0.
+    return tuple(
+        (u + 0.0, v + 0.0, w + 0.0, math.fsum((u * o[0], v * o[1], w * o[2])) + 0.0)
+        for u, v, w in rows
+    )
+
+
+def _local_coordinates(frame: _Frame, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+    """The local coordinates of a point, the one along the axis first. Coordinates may be numbers of
+    any arithmetic."""
+    along, across, other = (x * a + y * b + z * c - d for a, b, c, d in frame)
+    return along, across, other
+
+
+@dataclass(frozen=True)
+class Capsule(FormulaSolid):
+    """The points within `radius` of the segment from `start` to `end`. f is the signed distance.
+
+    Let h be the coordinate along the segment from its middle, u and v two coordinates across it,
+    and L its length. Then f = |(u, v, max(0, |h| - L/2))| - radius. As the distance from a set
+    minus a constant, f has the Lipschitz constant 1.
+    """
+
+    is_convex = True
+
+    # The unit vectors of the coordinates are rounded.
+    lipschitz = 1.0 + 1e-6
+
+    start: Point = (0.0, 0.0, -1.0)
+    end: Point = (0.0, 0.0, 1.0)
+    radius: float = 0.5
+    _frame: _Frame = dataclasses.field(init=False, repr=False, compare=False)
+    _half_length: float = dataclasses.field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the arguments, and compute the frame.
+
+        Raises:
+            ValueError: start and end are the same point, or the radius is not positive.
+        """
+        start = as_triple(self.start, "the start of a capsule")
+        end = as_triple(self.end, "the end of a capsule")
+        # Halves, so that nothing overflows.
+        half = [0.5 * b - 0.5 * a for a, b in zip(start, end, strict=True)]
+        half_length = math.hypot(*half)
+        if half_length == 0.0:
+            raise ValueError(f"a capsule from {start} to the same point is a sphere: use Sphere")
+        set_frozen(self, "start", start)
+        set_frozen(self, "end", end)
+        set_frozen(self, "radius", as_positive(self.radius, "the radius of a capsule"))
+        middle = [0.5 * a + 0.5 * b for a, b in zip(start, end, strict=True)]
+        set_frozen(self, "_frame", _axial_frame(middle, half))
+        set_frozen(self, "_half_length", half_length)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        along, across, other = _local_coordinates(self._frame, x, y, z)
+        beyond = maximum(abs(along) - self._half_length, 0.0)
+        return norm(across, other, beyond) - self.radius
+
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box of the segment, grown by radius
+        and level on each side. None if `above` (a volume for all points where f >= level), as these
+        points are unbounded."""
+        if above:
+            return None
+        return _box_around_balls((self.start, self.end), (self.radius + level, self.radius + level))
+
+
+@dataclass(frozen=True)
+class RoundCone(FormulaSolid):
+    """The convex hull of two balls, one about `start` and one about `end`: both spheres, and the
+    cone that touches both. f is the signed distance, with the Lipschitz constant 1.
+
+    radii: (2,) the radii of the balls about `start` and about `end`. If they are equal, the solid
+        is a capsule. If one ball contains the other, the solid is that ball.
+
+    Let r be the larger radius, h the coordinate along the axis from the center of the larger ball,
+    q the distance from the axis, L that of the centers, s = (difference of the radii)/L, and c =
+    sqrt(1 - s^2). The solid is the union of the balls about the points x_t of the axis with h = t,
+    0 <= t <= L, whose radii are r_t = r - s t. f is the least over t of |p - x_t| - r_t = |(q, h -
+    t)| - r + s t, a convex function of t. Its derivative vanishes at t = h - q s/c, and so the
+    least one is at this t, clipped to [0, L].
+
+    Proof that f is the signed distance. Outside, it is the distance from the nearest ball. The
+    signed distance from a convex set is, inside as well, the greatest of n . p minus its support
+    function over all unit vectors n; here that is the greatest of min_t (n . (p - x_t) - r_t). Over
+    all n with |n| <= 1, greatest and least may be exchanged, as the function is linear in n and in
+    t; this gives f. It remains to see that the greatest is attained at a unit vector. If p is not
+    on the axis between the centers, the n of the best t is one, the direction of p - x_t. If p is
+    such a point, f = -r_t at t = h, and a unit vector with n . (axis from the larger ball to the
+    smaller) = s gives this value for all t.
+
+    f is convex: it is the least over t of a function that is convex in p and t together.
+    """
+
+    is_convex = True
+
+    # The unit vectors of the coordinates and the slope are rounded.
+    lipschitz = 1.0 + 1e-6
+
+    start: Point = (0.0, 0.0, -1.0)
+    end: Point = (0.0, 0.0, 1.0)
+    radii: tuple[float, float] = (0.5, 0.25)
+    _frame: _Frame = dataclasses.field(init=False, repr=False, compare=False)
+    _numbers: tuple[float, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    _is_ball: bool = dataclasses.field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check the arguments, and compute the frame, the numbers r, L, s and s/c of the formula,
+        and whether one ball contains the other.
+
+        Raises:
+            ValueError: not two positive radii.
+        """
+        start = as_triple(self.start, "the start of a round cone")
+        end = as_triple(self.end, "the end of a round cone")
+        set_frozen(self, "start", start)
+        set_frozen(self, "end", end)
+        set_frozen(self, "radii", _checked_radii(self.radii))
+        centers, (large, small) = (start, end), self.radii
+        if small > large:
+            centers, (large, small) = (end, start), (small, large)
+        axis = [b - a for a, b in zip(*centers, strict=True)]
+        length, difference = math.hypot(*axis), large - small
+        is_ball = length <= difference or length == 0.0
+        slope, ratio = 0.0, 0.0
+        if is_ball:
+            axis = [0.0, 0.0, 1.0]
+        else:
+            slope = difference / length
+            # s/c, with a product that loses no digits where both lengths are nearly equal.
+            ratio = difference / math.sqrt((length - difference) * (length + difference))
+        set_frozen(self, "_frame", _axial_frame(centers[0], axis))
+        set_frozen(self, "_numbers", (large, length, slope, ratio))
+        set_frozen(self, "_is_ball", is_ball)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        along, across, other = _local_coordinates(self._frame, x, y, z)
+        radius, length, slope, ratio = self._numbers
+        if self._is_ball:
+            return norm(along, across, other) - radius
+        from_axis = norm(across, other)
+        t = minimum(maximum(along - from_axis * ratio, 0.0), length)
+        return norm(from_axis, along - t) + t * slope - radius
+
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """A box that contains all points where f <= level: the box around both balls, each with
+        the level added to its radius. (The sides of the balls between them vary linearly.) None if
+        `above`, as then the points are unbounded."""
+        if above:
+            return None
+        first, second = self.radii
+        return _box_around_balls((self.start, self.end), (first + level, second + level))
+
+
+def _checked_radii(radii: Any) -> tuple[float, float]:
+    """The two radii of a round cone as positive numbers.
+
+    Raises:
+        ValueError: there are not two, or one is not positive.
+    """
+    try:
+        first, second = radii
+    except (TypeError, ValueError):
+        raise ValueError(f"the radii of a round cone must be two numbers, not {radii!r}") from None
+    name = "the radii of a round cone"
+    return as_positive(first, name), as_positive(second, name)
+
+
+def _box_around_balls(centers: tuple[Point, Point], radii: tuple[float, float]) -> Volume:
+    """The box around two balls, whose radii may be negative: then the sides are shortened."""
+    (a, b), (r, s) = centers, radii
+    lower = [min(u - r, v - s) for u, v in zip(a, b, strict=True)]
+    upper = [max(u + r, v + s) for u, v in zip(a, b, strict=True)]
+    half = [0.5 * high - 0.5 * low for low, high in zip(lower, upper, strict=True)]
+    center = [0.5 * high + 0.5 * low for low, high in zip(lower, upper, strict=True)]
+    return box_around((half[0], half[1], half[2]), center)
