@@ -25,7 +25,8 @@ from harnack.enclosures import SlopeRange
 from harnack.enclosures.enclosure import PathPiece
 from harnack.fields.blobs.kernels import CompactKernel
 from harnack.fields.evaluator import POINTS, Plan
-from harnack.fields.formula import Formula, FormulaEvaluator, FormulaOnRay
+from harnack.fields.formula import Formula
+from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaOnRay
 from harnack.literature import clipped_power
 
 # Rounding of a blob's derivatives, in units of their largest absolute values.

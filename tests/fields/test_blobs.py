@@ -15,7 +15,7 @@ from harnack.enclosures import LevelGaps, choose_enclosures, longest_free_length
 from harnack.enclosures.samples import Ray
 from harnack.fields.blobs.blob_sums import for_each_record, sum_along
 from harnack.fields.blobs.grid import CellLists
-from harnack.fields.formula import FormulaEvaluator
+from harnack.fields.formula_evaluator import FormulaEvaluator
 from harnack.testing import check_field
 
 KERNELS = {

@@ -9,7 +9,7 @@ import pytest
 
 import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
-from harnack.fields.formula import FormulaEvaluator
+from harnack.fields.formula_evaluator import FormulaEvaluator
 from harnack.testing import check_field
 
 

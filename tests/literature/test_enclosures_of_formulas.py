@@ -30,7 +30,7 @@ from harnack.arithmetic import (
 from harnack.backend import choose_backend, to_float, to_vector3
 from harnack.enclosures import Enclosure, LevelGaps, SlopeRange, choose_enclosures
 from harnack.enclosures.selection import ENCLOSURE_NAMES
-from harnack.fields.formula import FormulaOnRay
+from harnack.fields.formula_evaluator import FormulaOnRay
 from harnack.literature import (
     AffineEnclosure,
     AffineForm,

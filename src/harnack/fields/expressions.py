@@ -19,7 +19,8 @@ import numpy as np
 
 from harnack import arithmetic
 from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
-from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
+from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
+from harnack.fields.formula_evaluator import as_jet
 from harnack.fields.tape_evaluator import recorded_tape
 from harnack.fields.vm_formulas import VmFormula
 from harnack.name_suggestions import did_you_mean

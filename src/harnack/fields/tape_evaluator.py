@@ -21,7 +21,7 @@ from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import RaySample
 from harnack.fields.batched_fields import FieldCache, cached_upload
-from harnack.fields.formula import Formula, FormulaEvaluator, FormulaOnRay
+from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaOnRay
 from harnack.tape.cells import CELL_MARGIN, TapeCells
 from harnack.tape.interpreter import TapeProgram
 from harnack.tape.operations import COORDINATE_COUNT
@@ -373,6 +373,6 @@ def _is_abrupt(field: Any, tally: Tally) -> bool:
     if getattr(field, "lipschitz", None) is not None:
         return tally.turns_within(1.0)
     parts = getattr(field, "parts", None)
-    if parts and not isinstance(field, Formula):
+    if parts and not hasattr(field, "tally"):
         return any(_is_abrupt(part, getattr(part, "tally", tally)) for part in parts)
     return tally.turns_within(tally.finest)

@@ -21,7 +21,7 @@ from harnack.arithmetic import Interval, Jet
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, LevelGaps, SlopeRange
 from harnack.enclosures.parabola import ParabolaEnclosure
-from harnack.fields.formula import FormulaOnRay
+from harnack.fields.formula_evaluator import FormulaOnRay
 from harnack.literature.affine_forms import AffineForm
 from harnack.literature.parabola_bounds import ParabolaBounds
 from harnack.literature.taylor_forms import LinearTaylorEnclosure, QuadraticTaylorEnclosure

@@ -18,7 +18,7 @@ from harnack.backend.elementary import safe_norm
 from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
 from harnack.fields.batch_evaluation import map_batches
 from harnack.fields.clearance import level_distance_lower_bound
-from harnack.fields.formula import without_alternatives
+from harnack.fields.formula_evaluator import without_alternatives
 from harnack.fields.solids.mesh_solid import share_samples
 from harnack.geometry.mesh_edges import row_norms
 from harnack.tracer.traced_surface import CallCache

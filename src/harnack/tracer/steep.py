@@ -24,7 +24,7 @@ import drjit as dr
 from harnack.arithmetic import Values
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_normalize
 from harnack.backend.loops import loop_while_active
-from harnack.fields.formula import without_alternatives
+from harnack.fields.formula_evaluator import without_alternatives
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3

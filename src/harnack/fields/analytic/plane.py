@@ -42,7 +42,8 @@ from harnack.fields.analytic.branches import (
 )
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
-from harnack.fields.formula import Formula, as_jet, probe_jets, warn_if_slow_to_compile
+from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
+from harnack.fields.formula_evaluator import as_jet
 from harnack.geometry.clip_volumes import Box, VolumeIntersection
 from harnack.name_suggestions import did_you_mean
 

@@ -57,14 +57,15 @@ from harnack.fields.blobs.group_maximum import (
 )
 from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Plan
-from harnack.fields.formula import Formula, FormulaEvaluator, is_jet
+from harnack.fields.formula import Formula
+from harnack.fields.formula_evaluator import FormulaEvaluator, is_jet
 from harnack.fields.parameters import record_arguments
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.formula import FormulaFunction
+    from harnack.fields.formula_evaluator import FormulaFunction
     from harnack.geometry import Volume
 
 # From this number of blobs on, a grid is faster than a sum over all blobs, by experiment.

@@ -41,14 +41,15 @@ from harnack.fields.blobs.blob_sums import (
     sum_jets,
 )
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Plan
-from harnack.fields.formula import Formula, FormulaEvaluator, is_jet
+from harnack.fields.formula import Formula
+from harnack.fields.formula_evaluator import FormulaEvaluator, is_jet
 from harnack.geometry import Box
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.backend import Backend, Real, Vec3
-    from harnack.fields.formula import FormulaFunction
+    from harnack.fields.formula_evaluator import FormulaFunction
     from harnack.geometry import Volume
 
 

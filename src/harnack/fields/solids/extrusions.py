@@ -26,7 +26,7 @@ from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import is_jet
+from harnack.fields.formula_evaluator import is_jet
 from harnack.fields.solids.deformations import Deformation, Taper, Twist
 from harnack.fields.solids.outline_distance import (
     OutlineEdges,

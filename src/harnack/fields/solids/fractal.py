@@ -21,14 +21,8 @@ from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_finite, as_integer_in_range, as_positive
 from harnack.enclosures import Lipschitz, TaylorRemainder
 from harnack.fields.evaluator import POINTS, Plan
-from harnack.fields.formula import (
-    Formula,
-    FormulaEvaluator,
-    FormulaFunction,
-    is_jet,
-    own_formula,
-    with_device_numbers,
-)
+from harnack.fields.formula import Formula, own_formula, with_device_numbers
+from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction, is_jet
 from harnack.fields.solids.solid import FormulaSolid
 from harnack.name_suggestions import is_one_of
 

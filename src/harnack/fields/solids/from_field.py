@@ -25,7 +25,8 @@ from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.formula import Formula, has_own_formula, is_jet, on_backend, own_formula
+from harnack.fields.formula import Formula, has_own_formula, on_backend, own_formula
+from harnack.fields.formula_evaluator import is_jet
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
 from harnack.fields.solids.solid import (

@@ -35,7 +35,7 @@ from harnack.enclosures.samples import Ray as Ray
 from harnack.enclosures.samples import RaySample, Sample
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import is_jet
+from harnack.fields.formula_evaluator import is_jet
 from harnack.fields.solids.solid import Solid, box_around, set_frozen
 from harnack.files.geometry_files import GEOMETRY_SUFFIXES, LoadedMesh, read_geometry
 from harnack.fmm.unit_frame import UnitFrame, frame_parameters, round_to_single

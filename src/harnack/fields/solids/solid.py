@@ -17,7 +17,8 @@ from harnack.backend.validation import as_positive, no_derivatives
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import Evaluator, Plan
 from harnack.fields.field import Field, Traits
-from harnack.fields.formula import Formula, FormulaFunction
+from harnack.fields.formula import Formula
+from harnack.fields.formula_evaluator import FormulaFunction
 from harnack.geometry import Ball, Box, Volume
 
 if TYPE_CHECKING:

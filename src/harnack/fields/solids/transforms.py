@@ -23,13 +23,12 @@ from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import (
+from harnack.fields.formula import own_formula, with_device_numbers
+from harnack.fields.formula_evaluator import (
     FormulaEvaluator,
     FormulaFunction,
     as_jet,
     hessian_error,
-    own_formula,
-    with_device_numbers,
 )
 from harnack.fields.parameters import Parametrized
 from harnack.fields.solids.solid import (
