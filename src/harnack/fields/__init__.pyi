@@ -25,6 +25,7 @@ from .capabilities import (
 from .expressions import expression
 from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator, Traits
 from .formula import Formula
+from .networks.network import Network
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
 from .solid_angles.polygon_mesh import PolygonMesh
@@ -58,6 +59,7 @@ __all__ = [
     "Lobes",
     "Molecule",
     "Morph",
+    "Network",
     "NearestFacet",
     "PatchEntry",
     "Patches",
