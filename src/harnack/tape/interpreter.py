@@ -17,6 +17,7 @@ import numpy as np
 from harnack.arithmetic import Interval, Jet, Values
 from harnack.arithmetic.jet import Dual
 from harnack.backend.arrays import upload_integers
+from harnack.backend.local_memory import allocate_local
 from harnack.backend.record_table import RecordTable
 from harnack.tape.operations import COORDINATE_COUNT, MAX_CONSTANTS
 
@@ -226,7 +227,7 @@ class TapeFormula:
         coordinates of all points."""
         backend = self.program.backend
         size = sum(layout.size for layout in layouts)
-        memory = [dr.alloc_local(backend.Float, self.program.slot_count) for _ in range(size)]
+        memory = [allocate_local(backend, self.program.slot_count) for _ in range(size)]
         for axis in range(COORDINATE_COUNT):
             parts = [
                 part

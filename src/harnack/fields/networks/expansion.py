@@ -134,8 +134,9 @@ class _Scalars:
 
     norm: |x|.
     error: E, the bound of the norm of the errors of x.
-    tangent_norm, tangent_error: the norm of all tangents of x, and of their errors.
-    lipschitz: a bound of the spectral norm of the Jacobian matrix of x, everywhere.
+    tangent_norm, tangent_error: the norm of the three tangents of x, and of their errors.
+    jacobian_error: a bound of the norm of the difference between the Jacobian matrix of x and that
+        of the linear network at p itself.
     spread: for each length P, or D for a ball.
     """
 
@@ -143,7 +144,7 @@ class _Scalars:
     error: Real
     tangent_norm: Real
     tangent_error: Real
-    lipschitz: Real
+    jacobian_error: Real
     spread: list[Real]
 
 
@@ -181,23 +182,25 @@ class _Forward:
         zero = backend.Float(0) + 0 * p.x
         real = lambda value: zero + value  # noqa: E731
         axes = [[real(float(i == k)) for i in range(INPUTS)] for k in range(INPUTS)]
-        tangents = axes if direction is None else [[real(direction[k]) for k in range(INPUTS)]]
-        count = 1 + len(tangents)
+        spreads = len(lengths)
+        count = 1 + INPUTS + spreads
         x = [allocate_local(backend, tables.width) for _ in range(count)]
         z = [allocate_local(backend, tables.width) for _ in range(count)]
         per_length = 1 if direction is None else 4
         kept_count = 4 + per_length * len(lengths)
         kept = [allocate_local(backend, tables.total) for _ in range(kept_count)]
-        for vector, numbers in zip(x, [[real(p[k]) for k in range(3)], *tangents], strict=True):
+        for vector, numbers in zip(
+            x, [[real(p[k]) for k in range(3)], *axes, *[[zero] * 3] * spreads], strict=True
+        ):
             for k in range(INPUTS):
                 vector[backend.UInt32(k)] = numbers[k]
             vector[backend.UInt32(INPUTS)] = zero
         state = _Scalars(
             norm=dr.norm(p) * _ROUND_UP,
             error=zero,
-            tangent_norm=real(1.001 if direction is not None else 1.7330),
+            tangent_norm=real(1.7330),
             tangent_error=zero,
-            lipschitz=real(1.0),
+            jacobian_error=zero,
             spread=[zero for _ in lengths],
         )
         return cls(
@@ -220,7 +223,7 @@ class _Forward:
     def _arrays(self) -> tuple[Any, ...]:
         """What changes from layer to layer."""
         s = self.state
-        scalars = [s.norm, s.error, s.tangent_norm, s.tangent_error, s.lipschitz]
+        scalars = [s.norm, s.error, s.tangent_norm, s.tangent_error, s.jacobian_error]
         memory = self.memory
         return scalars, s.spread, memory.x, memory.z, memory.kept, self.output
 
@@ -238,27 +241,30 @@ class _Forward:
         """The pass after another layer."""
         tables, layer = self.tables, self.tables.layer(index)
         x, z = tables.multiply(
-            self.memory.x, self.memory.z, layer.forward, layer.columns, layer.rows
+            self.memory.x, self.memory.z, layer.forward, layer.columns, layer.rows,
+            len(self.lengths),
         )
         before, zero = self.state, self.zero
         # Sums of squares: of values, errors, tangents, and for each length remainders or changes;
-        # the largest |m|, and for each length the largest slope.
+        # and wrong slopes; the largest |m|, for each length the largest slope, and that at p.
         n = len(self.lengths)
-        sums = [zero] * (4 + 2 * n)
+        sums = [zero] * (6 + 2 * n)
 
         def step(state: Any) -> Any:
             """Compute a neuron."""
             j, x, z, kept, sums, output = state
             neuron = _Neuron.at(self, layer, j, z)
             x[0][j] = neuron.point.value
-            for vector, tangent in zip(x[1:], neuron.tangents, strict=True):
+            for vector, tangent in zip(x[1 : len(x) - n], neuron.tangents, strict=True):
                 vector[j] = neuron.point.slope * tangent
+            for vector, spread in zip(x[-n:], neuron.spreads(layer), strict=True):
+                vector[j] = spread
             at = layer.first + j
             added = neuron.added()
             for vector, number in zip(kept, neuron.kept(), strict=True):
                 vector[at] = number
             sums = [
-                dr.fma(b, b, a) if k < 3 + n else fmax(a, b)
+                dr.fma(b, b, a) if k < 4 + n else fmax(a, b)
                 for k, (a, b) in enumerate(zip(sums, added, strict=True))
             ]
             return j + 1, x, z, kept, sums, neuron.add_to(output)
@@ -267,8 +273,8 @@ class _Forward:
         _, x, z, kept, sums, output = loop(
             start, lambda s: s[0] < layer.count, step, "neurons"
         )
-        norms = [dr.sqrt(entry) * _ROUND_UP for entry in sums[: 3 + n]]
-        slope, largest = sums[3 + n], sums[4 + n :]
+        norms = [dr.sqrt(entry) * _ROUND_UP for entry in sums[: 4 + n]]
+        slope, largest = sums[4 + n], sums[5 + n : -1]
         stretch = layer.spectral * _ROUND_UP
         gain = slope * stretch
         if self.direction is None:
@@ -276,7 +282,9 @@ class _Forward:
         else:
             gains = [gain] * n
         spread = [
-            dr.fma(by, old, new) for by, old, new in zip(gains, before.spread, norms[3:], strict=True)
+            dr.fma(by, old, new) for by, old, new in zip(
+                gains, before.spread, norms[3 : 3 + n], strict=True
+            )
         ]
         own = layer.forward_error * layer.frobenius * before.tangent_norm * slope
         state = _Scalars(
@@ -284,11 +292,11 @@ class _Forward:
             error=dr.fma(gain, before.error, norms[1]),
             tangent_norm=norms[2],
             tangent_error=dr.fma(gain, before.tangent_error, own + 4 * tables.unit * norms[2]),
-            lipschitz=before.lipschitz * layer.spectral * layer.max_slope * _ROUND_UP,
+            jacobian_error=dr.fma(sums[-1] * stretch, before.jacobian_error, norms[3 + n]),
             spread=spread,
         )
         return self._with((
-            [state.norm, state.error, state.tangent_norm, state.tangent_error, state.lipschitz],
+            [state.norm, state.error, state.tangent_norm, state.tangent_error, state.jacobian_error],
             spread, x, z, kept, output,
         ))  # fmt: skip
 
@@ -399,6 +407,7 @@ class _Neuron:
     wrong_slope: a bound of the difference between m and the slope of the part g at the exact z.
     second: a bound of the second derivative of g within `error` of z.
     is_hidden: whether rounding hides the sign of z, at a kink.
+    jacobian: a bound of the gradient of z.
     moves: for each length the remainder.
     """
 
@@ -422,7 +431,7 @@ class _Neuron:
         tables, before = forward.tables, forward.state
         bias, norm, output_weight = tables.neurons.read_record(layer.first + j)[:3]
         number = z[0][j] + bias
-        tangents = [vector[j] for vector in z[1:]]
+        tangents = [vector[j] for vector in z[1 : len(z) - len(forward.lengths)]]
         rows = layer.forward_error * _ROUND_UP
         smallest = float(dr.smallest(tables.backend.Float)) * 4096
         own = dr.fma(rows, dr.fma(norm, before.norm, dr.abs(bias)), smallest)
@@ -438,11 +447,13 @@ class _Neuron:
         wrong = dr.fma(second, error, point.slope_error)
         neuron = cls(
             forward, point, output_weight, own, error, tangents, size, wrong, second, kink,
-            is_hidden, norm * before.lipschitz * _ROUND_UP, [],
+            is_hidden, dr.fma(norm, before.jacobian_error, size) * _ROUND_UP, [],
         )  # fmt: skip
         moves = [
-            _Move.at(neuron, layer, number, norm * before.spread[k], tangent_error, length)
-            for k, length in enumerate(forward.lengths)
+            _Move.at(neuron, layer, number, fmin(norm * spread, vector[j]), tangent_error, length)
+            for spread, vector, length in zip(
+                before.spread, z[len(z) - len(forward.lengths) :], forward.lengths, strict=True
+            )
         ]
         return dataclasses.replace(neuron, moves=moves)
 
@@ -474,7 +485,18 @@ class _Neuron:
         slope = dr.abs(self.point.slope)
         lists = [self.point.value, self.local_error, slope * self.tangent_size]
         lists += [move.remainder for move in self.moves]
-        return [*lists, slope + self.point.slope_error, *(slope + move.change for move in self.moves)]
+        lists += [self.slope_change * self.tangent_size, slope + self.point.slope_error]
+        return [*lists, *(slope + move.change for move in self.moves), slope + self.slope_change]
+
+    def spreads(self, layer: LayerNumbers) -> list[Real]:
+        """For each length a bound, for the value a(z), of what `_Move.spread` bounds for z."""
+        spreads: list[Real] = []
+        for move in self.moves:
+            slope = dr.abs(self.point.slope)
+            if move.is_ball:
+                slope = fmin(slope + move.change, layer.max_slope)
+            spreads.append(dr.fma(slope, move.spread, move.remainder) * _ROUND_UP)
+        return spreads
 
     def add_to(self, output: list[Real]) -> list[Real]:
         """The output, to which the neuron's value with its weight is added: the sum of two numbers,
@@ -506,6 +528,7 @@ class _Move:
     length: Real
     gradient: Real
     jacobian: Real
+    spread: Real
     is_ball: bool
 
     @classmethod
@@ -519,7 +542,9 @@ class _Move:
             fastest = neuron.tangent_size + spread * _ROUND_UP
             slowest = -fastest
         else:
-            (tangent,), width = neuron.tangents, (spread + tangent_error) * _ROUND_UP
+            direction = neuron.forward.direction
+            tangent = sum(t * direction[k] for k, t in enumerate(neuron.tangents))
+            width = (spread + tangent_error) * _ROUND_UP + 4 * tables.unit * neuron.tangent_size
             fastest, slowest = tangent + width, tangent - width
         speed = fmax(dr.abs(fastest), dr.abs(slowest))
         longest = length * _ROUND_UP
@@ -552,6 +577,7 @@ class _Move:
             length,
             change * fastest,
             change * neuron.tangent_size,
+            spread,
             is_ball,
         )
 

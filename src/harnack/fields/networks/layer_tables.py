@@ -21,13 +21,21 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Index, Mask, Real
     from harnack.fields.networks.activations import Activation
 
-__all__ = ["INPUTS", "LayerNumbers", "LayerTables", "spectral_bound"]
+__all__ = [
+    "INPUTS",
+    "MAX_WIDTH",
+    "LayerNumbers",
+    "LayerTables",
+    "loop",
+    "masked",
+    "spectral_bound",
+]
 
 INPUTS = 3
 # A block of a matrix is `_ROWS` rows and one column; an iteration of the loop reads `_COLUMNS`.
 _ROWS, _COLUMNS = 16, 4
 # Sums of squares of fewer numbers than this have a relative error below `NORM_FACTOR` - 1.
-_MAX_WIDTH = 4096
+MAX_WIDTH = 4096
 _NORM_FACTOR = 1.001
 # Local memory has room for a power of two of numbers, so that kernels do not depend on it.
 _MIN_WIDTH = 32
@@ -198,11 +206,13 @@ class LayerTables:
         packet: Index,
         columns: Index,
         rows: Index,
+        positive: int = 0,
     ) -> tuple[list[Any], list[Any]]:
         """Multiply vectors in local memory by a matrix. Returns the changed `inputs` and `outputs`.
 
         inputs, outputs: for each vector an array of local memory.
         packet: the first packet of the matrix. columns, rows: of its loops (`LayerNumbers`).
+        positive: how many of the vectors, the last ones, are multiplied by the absolute values.
 
         A row is the sum over iterations of sums of four products, each by fused multiply-adds. So
         a term is rounded at most 4 times in its iteration, and once in each iteration
@@ -219,8 +229,11 @@ class LayerTables:
                 column = i * _COLUMNS + c
                 at = packet + (row * (columns * _COLUMNS) + column) * (_ROWS // PACKET)
                 weights = self._packet(at) + self._packet(at + 1)
+                sizes = [dr.abs(weight) for weight in weights] if positive else []
                 for q, vector in enumerate(inputs):
                     x = vector[column]
+                    if q == count - positive:
+                        weights = sizes
                     for r in range(_ROWS):
                         k = q * _ROWS + r
                         part = parts[k]
