@@ -29,6 +29,7 @@ from .inclusion import inclusion
 from .laplacian import laplacian
 from .live import live
 from .meshes import meshes
+from .networks import networks
 from .pictures import pictures
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
@@ -41,7 +42,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster", "curves", "hollow",
+    "pictures", "live", "cluster", "curves", "hollow", "networks",
 )  # fmt: skip
 
 
@@ -101,6 +102,7 @@ def main() -> None:
         "formulas": formulas,
         "live": live,
         "meshes": meshes,
+        "networks": networks,
         "pictures": pictures,
         "repair": lambda: repair(arguments.meshes),
         "povray": compare_with_povray,

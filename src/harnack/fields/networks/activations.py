@@ -92,7 +92,9 @@ class Activation(abc.ABC):
         if parameter is None:
             return cls()
         if not cls.parameter_name:
-            raise ValueError(f"the activation {cls.name} has no parameter, and was given {parameter}")
+            raise ValueError(
+                f"the activation {cls.name} has no parameter, and was given {parameter}"
+            )
         number = float(parameter)
         if not (math.isfinite(number) and number > 0):
             raise ValueError(
@@ -325,7 +327,10 @@ class Sine(Activation):
         return np.sin(angle), self.parameter * np.cos(angle)
 
     def second_bound(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        middle, half = 0.5 * self.parameter * (lower + upper), 0.5 * self.parameter * (upper - lower)
+        middle, half = (
+            0.5 * self.parameter * (lower + upper),
+            0.5 * self.parameter * (upper - lower),
+        )
         size = np.abs(np.sin(middle)) + half + 1e-12 * (1 + np.abs(middle))
         return self.parameter**2 * np.minimum(size, 1.0)
 
@@ -349,7 +354,7 @@ def activation_of(choice: Any) -> Activation:
         name, parameter = choice
     if not isinstance(name, str):
         raise TypeError(
-            f"an activation is a name such as \"relu\", or a pair such as (\"sine\", 30.0), not "
+            f'an activation is a name such as "relu", or a pair such as ("sine", 30.0), not '
             f"{choice!r}"
         )
     if name not in ACTIVATIONS:

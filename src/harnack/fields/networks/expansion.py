@@ -241,7 +241,11 @@ class _Forward:
         """The pass after another layer."""
         tables, layer = self.tables, self.tables.layer(index)
         x, z = tables.multiply(
-            self.memory.x, self.memory.z, layer.forward, layer.columns, layer.rows,
+            self.memory.x,
+            self.memory.z,
+            layer.forward,
+            layer.columns,
+            layer.rows,
             len(self.lengths),
         )
         before, zero = self.state, self.zero
@@ -270,9 +274,7 @@ class _Forward:
             return j + 1, x, z, kept, sums, neuron.add_to(output)
 
         start = (tables.backend.UInt32(0), x, z, self.memory.kept, sums, self.output)
-        _, x, z, kept, sums, output = loop(
-            start, lambda s: s[0] < layer.count, step, "neurons"
-        )
+        _, x, z, kept, sums, output = loop(start, lambda s: s[0] < layer.count, step, "neurons")
         norms = [dr.sqrt(entry) * _ROUND_UP for entry in sums[: 4 + n]]
         slope, largest = sums[4 + n], sums[5 + n : -1]
         stretch = layer.spectral * _ROUND_UP
@@ -282,9 +284,8 @@ class _Forward:
         else:
             gains = [gain] * n
         spread = [
-            dr.fma(by, old, new) for by, old, new in zip(
-                gains, before.spread, norms[3 : 3 + n], strict=True
-            )
+            dr.fma(by, old, new)
+            for by, old, new in zip(gains, before.spread, norms[3 : 3 + n], strict=True)
         ]
         own = layer.forward_error * layer.frobenius * before.tangent_norm * slope
         state = _Scalars(
@@ -333,7 +334,14 @@ class _Forward:
                 m = numbers[0]
                 z[0][j] = m * a
                 sums = self._summed(sums, numbers, a, error)
-                return j + 1, x, z, kept, sums, [dr.fma(m * a, m * a, norms[0]), fmax(norms[1], dr.abs(m))]
+                return (
+                    j + 1,
+                    x,
+                    z,
+                    kept,
+                    sums,
+                    [dr.fma(m * a, m * a, norms[0]), fmax(norms[1], dr.abs(m))],
+                )
 
             _, x, z, kept, sums, norms = loop(
                 (u(0), x, z, kept, sums, [zero, zero]), lambda s: s[0] < layer.count, step, "back"
@@ -344,7 +352,14 @@ class _Forward:
             error = dr.fma(norms[1] * layer.spectral * _ROUND_UP, error, own * _ROUND_UP)
             return index - 1, x, z, kept, sums, error
 
-        start = (tables.layer_count + u(0 * zero), x, self.memory.z[:1], self.memory.kept, sums, error)
+        start = (
+            tables.layer_count + u(0 * zero),
+            x,
+            self.memory.z[:1],
+            self.memory.kept,
+            sums,
+            error,
+        )
         _, x, _, _, sums, error = loop(start, lambda s: s[0] > 0, layer_step, "layers back")
         gradient = type(p)(*(x[0][u(k)] for k in range(INPUTS)))
         return self._result(gradient, sums, error)
@@ -355,7 +370,10 @@ class _Forward:
         numbers: what was kept of it. a: A, with this error.
         """
         size = dr.abs(a) + error
-        new = [dr.fma(size, number, total) for number, total in zip(numbers[1:4], sums[:3], strict=True)]
+        new = [
+            dr.fma(size, number, total)
+            for number, total in zip(numbers[1:4], sums[:3], strict=True)
+        ]
         if self.direction is None:
             return new + [dr.fma(size, n, t) for n, t in zip(numbers[4:], sums[3:], strict=True)]
         for k in range((len(numbers) - 4) // 2):

@@ -252,9 +252,7 @@ class LayerTables:
                     vector[row * _ROWS + r] = sums[q * _ROWS + r]
             return row + 1, inputs, outputs
 
-        _, inputs, outputs = _loop(
-            (u(0), inputs, outputs), lambda s: s[0] < rows, row_step, "rows"
-        )
+        _, inputs, outputs = _loop((u(0), inputs, outputs), lambda s: s[0] < rows, row_step, "rows")
         return inputs, outputs
 
     def _packet(self, index: Index) -> list[Real]:
@@ -271,9 +269,7 @@ def _sum_error(columns: int) -> float:
 
 def _loop(state: Any, condition: Any, step: Any, label: str) -> Any:
     """A recorded loop over a tuple of values."""
-    return dr.while_loop(
-        state, lambda *s: condition(s), lambda *s: step(s), label=label
-    )
+    return dr.while_loop(state, lambda *s: condition(s), lambda *s: step(s), label=label)
 
 
 def loop(state: Any, condition: Any, step: Any, label: str) -> Any:

@@ -40,7 +40,7 @@ __all__ = ["Network"]
 
 Layer: TypeAlias = "tuple[FloatArray, FloatArray]"
 
-# The radii of balls in which samples bound the gradient, as fractions of the diagonal of the domain.
+# The radii of balls in which samples bound the gradient, as fractions of the domain's diagonal.
 # The cells of the grids below, of which 8 and 32 are across, are a bit smaller than balls of them.
 _RADII = (0.25, 0.07, 2.0**-6, 2.0**-8)
 # On a ray the change is bounded up to the wanted length, and up to this part of it; the next sample
@@ -253,7 +253,9 @@ def _checked_layers(layers: Any) -> tuple[Layer, ...]:
     for index, pair in enumerate(pairs):
         name = f"layer {index}"
         if not isinstance(pair, Sequence) or len(cast("Sequence[Any]", pair)) != 2:
-            raise TypeError(f"{name} is no pair (weights, bias): layers = [(W0, b0), (W1, b1), ...]")
+            raise TypeError(
+                f"{name} is no pair (weights, bias): layers = [(W0, b0), (W1, b1), ...]"
+            )
         weights, bias = (
             np.array(as_real_array(part, f"{what} of {name}", type_error=TypeError), np.float64)
             for part, what in zip(cast("Sequence[Any]", pair), ("weights", "bias"), strict=True)
@@ -301,7 +303,7 @@ def _layers_of_names(arrays: dict[str, Any], path: str) -> list[tuple[Any, Any]]
         match = re.search(r"weight|bias", name)
         if match is None:
             raise ValueError(
-                f"{path} has an array {name!r}: names of layers contain \"weight\" or \"bias\", such "
+                f'{path} has an array {name!r}: names of layers contain "weight" or "bias", such '
                 "as 0.weight and 0.bias, or weight_0 and bias_0"
             )
         layer = name[: match.start()] + name[match.end() :]
@@ -314,9 +316,7 @@ def _layers_of_names(arrays: dict[str, Any], path: str) -> list[tuple[Any, Any]]
     def numbers(name: str) -> list[int]:
         return [int(digits) for digits in re.findall(r"\d+", name)]
 
-    return [
-        (layers[name]["weight"], layers[name]["bias"]) for name in sorted(layers, key=numbers)
-    ]
+    return [(layers[name]["weight"], layers[name]["bias"]) for name in sorted(layers, key=numbers)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,9 +362,7 @@ class _NetworkEvaluator(Evaluator):
                 ParabolaEnclosure(slopes, bound.lower_second, bound.upper_second, bound.length)
             )
         sample = self._sample(expansion, (self._everywhere(p),))
-        return RaySample(
-            sample, tuple(enclosures), (), slope, _REACH_GROWTH, expansion.slope_error
-        )
+        return RaySample(sample, tuple(enclosures), (), slope, _REACH_GROWTH, expansion.slope_error)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
         bounds = cast("tuple[BallBound, ...]", expand(self.tables, p, [radius], None).bounds)
