@@ -15,6 +15,7 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.local_memory import allocate_local
 from harnack.testing import check_field
+from harnack.webgpu import UntranslatableError
 from tests.oracles.networks import first_hits, network_value_and_gradient
 
 ACTIVATIONS: dict[str, Any] = {
@@ -192,17 +193,28 @@ def test_networks_of_other_sizes_use_kernels_of_their_own() -> None:
         assert np.allclose(value, network_value_and_gradient(layers, "relu", points)[0], atol=1e-12)
 
 
-def test_meshes_and_solids() -> None:
+@pytest.mark.slow
+def test_meshes() -> None:
     layers = ball_layers()
-    mesh = hk.mesh(hk.Network(layers), cell_size=0.15)
+    mesh = hk.mesh(hk.Network(layers), cell_size=0.3)
     vertices = np.asarray(mesh.vertices)
     value, _ = network_value_and_gradient(layers, "relu", vertices)
     assert len(vertices) > 50
     assert np.abs(value).max() < 1e-3
-    solid = hk.solid(hk.Network(layers)) - hk.Sphere(0.3)
+
+
+def test_solids_and_distances() -> None:
+    network = hk.Network(ball_layers())
+    solid = hk.solid(network, below=0.0) - hk.Sphere(0.3)
     hits = hk.trace(solid, [[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
     assert hits.t[0] == pytest.approx(0.3, abs=1e-3)
-    assert hk.signed_distance(hk.Network(layers), [[0.0, 0.0, 0.0]])[0] < -0.4
+    distance = hk.signed_distance(network, [[0.0, 0.0, 0.0]])[0]
+    assert distance == pytest.approx(-0.9 / np.sqrt(3), abs=1e-3)
+
+
+def test_pages_say_what_they_cannot_show(tmp_path: Path) -> None:
+    with pytest.raises(UntranslatableError, match="local memory"):
+        hk.page(hk.Network(ball_layers()), tmp_path / "page.html")
 
 
 def ball_layers() -> list[tuple[Any, Any]]:

@@ -247,8 +247,8 @@ class Softplus(Activation):
 
 @dataclass(frozen=True)
 class ELU(Activation):
-    """z for z > 0, and c (exp z - 1) for z <= 0, with the parameter c: a kink of 1 - c, and a part g
-    = c z or c (exp z - 1), whose second derivative is 0 or c exp z.
+    """z for z > 0, and c (exp z - 1) for z <= 0, with the parameter c: a kink of 1 - c, and a part
+    g = c z or c (exp z - 1), whose second derivative is 0 or c exp z.
 
     Errors. exp z has an absolute error of at most 17u for z <= 0.
     """

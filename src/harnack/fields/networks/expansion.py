@@ -13,13 +13,17 @@ So each remainder enters once, with the weight and the sign that it really has, 
 lost by bounding the values of layers one after another. It is needed only how far each z may move.
 
 **How far z moves** from p along a ray to the length s <= L: z(s) - z(0) = t s + e(s), where t is
-the derivative by s of the linear network, and |e(s)| <= s |w| P, with the norm |w| of the row and a
-bound s P of the norm of the remainders of the values x. P is 0 at first, and for the values of
-the next layer it is max |m| |W| P, with the spectral norm |W|, plus the norm of the neurons' own
-remainders per length. In a ball of radius L the same holds in all directions at once: the
-Jacobian matrix of x at a point of the ball differs from that of the linear network by at most D, and
-in the next layer by the largest slope times |W| D plus the norm of the changes of slopes times the
-gradients of z, which are computed as three tangents.
+the derivative by s of the linear network, and |e(s)| <= s q. q is the smaller of two bounds. One is
+sum |w_i| q_i over the values x_i of the layer before, each of which has a remainder of at most q_i
+s: |m| times q of its own z, plus its own remainder per length. The other is |w| P, with the norm
+|w| of the row and a bound P of the norm of all these remainders; in the next layer P is max |m| |W|
+P, with the spectral norm |W|, plus the norm of the neurons' own remainders. The first one is
+sharper where few neurons have a remainder, the second one where many have.
+
+In a ball of radius L the same holds in all directions at once, for the Jacobian matrix in place of
+the values: at a point of the ball the gradient of z differs from that of the linear network by at
+most q, and in the next layer slopes take the place of m, and changes of slopes times gradients that
+of remainders.
 
 **A remainder.** Let a = g + k max(z, 0) (`activations`), z(s) - z(0) = d and d/s in [l, h]. By
 Taylor's formula the part g adds q d^2/2, where q is a second derivative of g between the two z, and
@@ -72,8 +76,6 @@ _ROUND_UP = 1.002
 class RayBound:
     """Bounds of the change of f along a ray, f(s) - f(0) - slope s for 0 <= s <= length:
     between lower_slope s + lower_second s^2/2 and upper_slope s + upper_second s^2/2.
-
-    start: a bound of the error of the slope at s = 0 by the slopes of neurons.
     """
 
     length: Real
@@ -297,7 +299,10 @@ class _Forward:
             spread=spread,
         )
         return self._with((
-            [state.norm, state.error, state.tangent_norm, state.tangent_error, state.jacobian_error],
+            [
+                state.norm, state.error, state.tangent_norm, state.tangent_error,
+                state.jacobian_error,
+            ],
             spread, x, z, kept, output,
         ))  # fmt: skip
 
