@@ -212,6 +212,7 @@ def test_solids_and_distances() -> None:
     assert distance == pytest.approx(-0.9 / np.sqrt(3), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_pages_say_what_they_cannot_show(tmp_path: Path) -> None:
     with pytest.raises(UntranslatableError, match="local memory"):
         hk.page(hk.Network(ball_layers()), tmp_path / "page.html")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -349,9 +349,10 @@ def activation_of(choice: Any) -> Activation:
     """
     if isinstance(choice, Activation):
         return choice
-    name, parameter = choice, None
-    if isinstance(choice, tuple) and len(choice) == 2:
-        name, parameter = choice
+    name: Any = choice
+    parameter: Any = None
+    if isinstance(choice, tuple) and len(cast("tuple[Any, ...]", choice)) == 2:
+        name, parameter = cast("tuple[Any, Any]", choice)
     if not isinstance(name, str):
         raise TypeError(
             f'an activation is a name such as "relu", or a pair such as ("sine", 30.0), not '

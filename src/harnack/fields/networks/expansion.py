@@ -50,7 +50,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 
@@ -67,6 +67,7 @@ if TYPE_CHECKING:
 
 __all__ = ["BallBound", "Expansion", "RayBound", "expand"]
 
+_FiveNumbers: TypeAlias = "tuple[Any, Any, Any, Any, Any]"
 # Covers the roundings of bounds, each of which is a sum or product of positive numbers, or a
 # square root; sums over layers have their own factor.
 _ROUND_UP = 1.002
@@ -182,8 +183,13 @@ class _Forward:
         """The pass at the points themselves."""
         backend = tables.backend
         zero = backend.Float(0) + 0 * p.x
-        real = lambda value: zero + value  # noqa: E731
-        axes = [[real(float(i == k)) for i in range(INPUTS)] for k in range(INPUTS)]
+
+        def real(value: Any) -> Real:
+            return zero + value
+
+        axes: list[list[Real]] = [
+            [real(float(i == k)) for i in range(INPUTS)] for k in range(INPUTS)
+        ]
         spreads = len(lengths)
         count = 1 + INPUTS + spreads
         x = [allocate_local(backend, tables.width) for _ in range(count)]
@@ -234,7 +240,7 @@ class _Forward:
         scalars, spread, x, z, kept, output = arrays
         return dataclasses.replace(
             self,
-            state=_Scalars(*scalars, list(spread)),
+            state=_Scalars(*cast("_FiveNumbers", tuple(scalars)), list(spread)),
             memory=_Memory(list(x), list(z), list(kept)),
             output=list(output),
         )
@@ -566,7 +572,9 @@ class _Move:
             slowest = -fastest
         else:
             direction = neuron.forward.direction
-            tangent = sum(t * direction[k] for k, t in enumerate(neuron.tangents))
+            assert direction is not None
+            tx, ty, tz = neuron.tangents
+            tangent = tx * direction[0] + ty * direction[1] + tz * direction[2]
             width = (spread + tangent_error) * _ROUND_UP + 4 * tables.unit * neuron.tangent_size
             fastest, slowest = tangent + width, tangent - width
         speed = fmax(dr.abs(fastest), dr.abs(slowest))

@@ -8,6 +8,7 @@ padded with zeros to whole blocks.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -143,13 +144,16 @@ class LayerTables:
     def upload(
         cls,
         backend: Backend,
-        layers: list[tuple[FloatArray, FloatArray]],
+        layers: Sequence[tuple[FloatArray, FloatArray]],
         activations: tuple[Activation, ...],
     ) -> LayerTables:
         """Upload a network. layers: weights (m, k) and biases (m,); the last has one row.
         activations: one for each layer but the last."""
         kinds = tuple({type(entry): entry for entry in activations}.values())
-        integers, floats, blocks, records = [], [], [], []
+        integers: list[int] = []
+        floats: list[float] = []
+        blocks: list[FloatArray] = []
+        records: list[FloatArray] = []
         unit, packets, first, before = 0.5 * backend.machine_epsilon, 0, 0, _COLUMNS
         output, output_bias = layers[-1]
         for index, (weights, bias) in enumerate(layers[:-1]):
@@ -177,12 +181,12 @@ class LayerTables:
             blocks += pieces
             packets, first, before = packets + sum(sizes), first + count, count
         # Rounded up, also to single precision.
-        floats = np.array(floats) * np.tile([1, 1, *[1 + 4 * unit] * 4], len(layers) - 1)
+        rounded = np.array(floats) * np.tile([1, 1, *[1 + 4 * unit] * 4], len(layers) - 1)
         return cls(
             backend,
             dr.opaque(backend.UInt32, len(layers) - 1),
             upload_integers(backend, np.array(integers)),
-            upload_floats(backend, floats),
+            upload_floats(backend, rounded),
             upload_floats(backend, np.concatenate(blocks)),
             RecordTable.upload(backend, np.concatenate(records)),
             dr.opaque(backend.Float, float(output_bias[0])),
@@ -244,7 +248,7 @@ class LayerTables:
             """Compute a block of rows."""
             row, inputs, outputs = state
             zeros = [self.backend.Float(0) + 0 * self.backend.Float(row)] * (count * _ROWS)
-            _, _, inputs, sums = _loop(
+            _, _, inputs, sums = loop(
                 (u(0), row, inputs, zeros), lambda s: s[0] < columns, column_step, "columns"
             )
             for q, vector in enumerate(outputs):
@@ -252,7 +256,7 @@ class LayerTables:
                     vector[row * _ROWS + r] = sums[q * _ROWS + r]
             return row + 1, inputs, outputs
 
-        _, inputs, outputs = _loop((u(0), inputs, outputs), lambda s: s[0] < rows, row_step, "rows")
+        _, inputs, outputs = loop((u(0), inputs, outputs), lambda s: s[0] < rows, row_step, "rows")
         return inputs, outputs
 
     def _packet(self, index: Index) -> list[Real]:
@@ -267,15 +271,21 @@ def _sum_error(columns: int) -> float:
     return 1.001 * (_COLUMNS + columns // _COLUMNS + 4)
 
 
-def _loop(state: Any, condition: Any, step: Any, label: str) -> Any:
-    """A recorded loop over a tuple of values."""
-    return dr.while_loop(state, lambda *s: condition(s), lambda *s: step(s), label=label)
-
-
-def loop(state: Any, condition: Any, step: Any, label: str) -> Any:
+def loop(
+    state: Any, condition: Callable[[Any], Mask], step: Callable[[Any], Any], label: str
+) -> Any:
     """A recorded loop over a tuple `state`: while condition(state) is true, the state becomes
     step(state)."""
-    return _loop(state, condition, step, label)
+    return dr.while_loop(state, _of_tuple(condition), _of_tuple(step), label=label)
+
+
+def _of_tuple(function: Callable[[Any], Any]) -> Callable[..., Any]:
+    """The function of a tuple as a function of its entries."""
+
+    def of_entries(*entries: Any) -> Any:
+        return function(entries)
+
+    return of_entries
 
 
 def masked(mask: Mask, value: Real) -> Real:

@@ -3,7 +3,7 @@ class and by its attributes."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def layers_of_modules(module: Any) -> tuple[list[tuple[Any, Any]], list[Any]]:
     layers: list[tuple[Any, Any]] = []
     activations: list[Any] = []
     for entry in _flattened(module):
-        is_layer = isinstance(entry, tuple) and isinstance(entry[0], np.ndarray)
+        is_layer = isinstance(entry, tuple) and isinstance(cast("Any", entry)[0], np.ndarray)
         if is_layer != (len(layers) == len(activations)):
             wanted = "a Linear layer" if len(layers) == len(activations) else "an activation"
             number = len(layers) + len(activations)
