@@ -25,7 +25,7 @@ def layers_of_modules(module: Any) -> tuple[list[tuple[Any, Any]], list[Any]]:
     layers: list[tuple[Any, Any]] = []
     activations: list[Any] = []
     for entry in _flattened(module):
-        is_layer = isinstance(entry, tuple) and isinstance(cast("Any", entry)[0], np.ndarray)
+        is_layer = _is_layer(entry)
         if is_layer != (len(layers) == len(activations)):
             wanted = "a Linear layer" if len(layers) == len(activations) else "an activation"
             number = len(layers) + len(activations)
@@ -40,6 +40,11 @@ def layers_of_modules(module: Any) -> tuple[list[tuple[Any, Any]], list[Any]]:
     if len(layers) == len(activations):
         raise ValueError("the network must end with a Linear layer, not with an activation")
     return layers, activations
+
+
+def _is_layer(entry: Any) -> bool:
+    """Whether an entry of `_flattened` is a layer, and not an activation."""
+    return isinstance(entry, tuple) and isinstance(cast("Any", entry)[0], np.ndarray)
 
 
 def _flattened(module: Any) -> list[Any]:
