@@ -30,6 +30,7 @@ from .laplacian import laplacian
 from .live import live
 from .many_parts import many_parts
 from .meshes import meshes
+from .networks import networks
 from .pictures import pictures
 from .povray import compare_with_povray, has_povray
 from .rays import RULES, WIDTH, Row, machine, measure, published
@@ -42,7 +43,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster", "curves", "hollow", "parts",
+    "pictures", "live", "cluster", "curves", "hollow", "parts", "networks",
 )  # fmt: skip
 
 
@@ -102,6 +103,7 @@ def main() -> None:
         "formulas": formulas,
         "live": live,
         "meshes": meshes,
+        "networks": networks,
         "parts": many_parts,
         "pictures": pictures,
         "repair": lambda: repair(arguments.meshes),

@@ -28,6 +28,7 @@ from .fields.analytic.polynomial import HarmonicPolynomial, SphericalHarmonic
 from .fields.blobs.blobs import Blobs
 from .fields.expressions import expression
 from .fields.field import Field
+from .fields.networks.network import Network
 from .fields.solid_angles.dipole import DipolePotential
 from .fields.solid_angles.polygon_mesh import PolygonMesh
 from .fields.solid_angles.solid_angle import SolidAngle
@@ -63,6 +64,7 @@ __all__ = [
     "Hits",
     "Isolines",
     "MeshingError",
+    "Network",
     "PolygonMesh",
     "Progress",
     "RayStatus",

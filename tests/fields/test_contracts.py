@@ -36,6 +36,7 @@ from harnack.geometry.example_meshes import bumpy_sphere, icosphere, remove_face
 from harnack.testing import BrokenPromiseError, check_field, check_ray_samples
 from harnack.testing.enclosure_contracts import PromiseCase
 from tests.enclosures.test_bounded_laplacian import FIELDS as SOURCED
+from tests.fields.test_network import random_layers
 from tests.fields.test_shapes import SHAPES
 from tests.literature.test_enclosures_of_formulas import PROOFS
 from tests.oracles.direct_sums import dipole_sum, winding_sum
@@ -159,6 +160,7 @@ REAL: dict[str, Field] = {
         ((-1.0, -1.0, -0.5), (1.0, 1.0, 0.5)),
         (7, 6, 4),
     ),
+    "network": hk.Network(random_layers(3), activation=["elu", ("sine", 2.0)]),
 }
 OWN: dict[str, Field] = {
     "charges": Charges(),
@@ -216,6 +218,7 @@ PROMISES_OF: dict[str, tuple[Promise, ...]] = {
     **dict.fromkeys(("lobes 3,2", "lobes 2,1, positive", "Fourier series", "smoothed"), (_BENT,)),
     **dict.fromkeys(SOURCED, (BoundedLaplacian(1.0, -1.0, 1.0, -1.0, 1.0),)),
     "screened": (_PLANE_BALL, _BENT),
+    "network": (_STEEP,),
 }
 PAIRS = [
     (name, bound)

@@ -61,6 +61,7 @@ FIELD_ROOMS = (
     "expressions",
     "solids",
     "blobs",
+    "networks",
 )
 # Bases of `Field`, which answer with fields and so name it in their types.
 CAPABILITIES = ("capabilities",)

@@ -25,6 +25,7 @@ from .capabilities import (
 from .expressions import expression
 from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator, Traits
 from .formula import Formula
+from .networks.network import Network
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
 from .solid_angles.polygon_mesh import PolygonMesh
@@ -59,6 +60,7 @@ __all__ = [
     "Molecule",
     "Morph",
     "NearestFacet",
+    "Network",
     "PatchEntry",
     "Patches",
     "Plan",

@@ -17,6 +17,7 @@ import numpy as np
 from harnack.arithmetic import Interval, Jet, Values
 from harnack.arithmetic.jet import Dual
 from harnack.backend.arrays import upload_integers
+from harnack.backend.local_memory import allocate_local
 from harnack.backend.record_table import RecordTable
 from harnack.tape.operations import COORDINATE_COUNT, MAX_CONSTANTS
 
@@ -216,12 +217,9 @@ class TapeFormula:
 
         start = self.begin + backend.UInt32(0 * zero)
         last = [zero for _ in memory]
-        # Dr.Jit takes kernels that differ in the size of local memory alone for one, and would run
-        # the one with too little of it. The label is a part of the kernel's text.
         _, parts, _ = dr.while_loop(
-            (start, last, memory), lambda k, last, memory: k < self.end, body,
-            label=f"tape{program.slot_count}",
-        )  # fmt: skip
+            (start, last, memory), lambda k, last, memory: k < self.end, body, label="tape"
+        )
         return _numbers_of_parts(layouts, parts, numbers)
 
     def _memory(self, layouts: list[_Layout], numbers: list[Any], zero: Real) -> list[Any]:
@@ -229,7 +227,7 @@ class TapeFormula:
         coordinates of all points."""
         backend = self.program.backend
         size = sum(layout.size for layout in layouts)
-        memory = [dr.alloc_local(backend.Float, self.program.slot_count) for _ in range(size)]
+        memory = [allocate_local(backend, self.program.slot_count) for _ in range(size)]
         for axis in range(COORDINATE_COUNT):
             parts = [
                 part

@@ -268,6 +268,12 @@ class _LLVMParser:
                     # that the pattern has found.
                     action(*((result,) if result else ()), *match.groups())
                     return
+            if " = alloca " in text:
+                raise UntranslatableError(
+                    "a kernel of this field uses arrays in local memory (drjit.alloc_local), as "
+                    "those of networks and of long formulas do, which are not translated for other "
+                    "GPUs"
+                )
             raise UntranslatableError(
                 f"a kernel of this field holds what is not translated for other GPUs: {text[:160]}"
             )

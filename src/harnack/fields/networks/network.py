@@ -1,0 +1,388 @@
+"""Neural networks as fields: multilayer perceptrons, whose level sets are traced with a proof."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.elementary import clamp, safe_norm
+from harnack.backend.validation import as_real_array, make_read_only
+from harnack.enclosures import Lipschitz, SlopeRange
+from harnack.enclosures.parabola import ParabolaEnclosure
+from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
+from harnack.enclosures.samples import RaySample, Sample
+from harnack.fields.batched_fields import FieldCache, cached_upload
+from harnack.fields.clearance import occupied_cells
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.field import Field, Traits
+from harnack.fields.networks.activations import Activation, activation_of
+from harnack.fields.networks.expansion import BallBound, Expansion, RayBound, expand
+from harnack.fields.networks.layer_tables import INPUTS, MAX_WIDTH, LayerTables, spectral_bound
+from harnack.fields.networks.torch_modules import layers_of_modules
+from harnack.geometry.clip_volumes import Box
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.enclosures.samples import Ray
+    from harnack.geometry.volume import Volume
+    from harnack.tree.empty_space import OccupancyGrid
+
+__all__ = ["Network"]
+
+Layer: TypeAlias = "tuple[FloatArray, FloatArray]"
+
+# The radii of balls in which samples bound the gradient, as fractions of the domain's diagonal.
+# The cells of the grids below, of which 8 and 32 are across, are a bit smaller than balls of them.
+_RADII = (0.25, 0.07, 2.0**-6, 2.0**-8)
+# On a ray the change is bounded up to the wanted length, and up to this part of it; the next sample
+# asks for a length of so many proved steps. By experiment, as the numbers of cells.
+_SHORTER, _REACH_GROWTH = 0.25, 4.0
+_COARSE_CELLS, _CELLS = 8, 32
+# For fewer rays than this, or for more weights, no fine cells are made.
+_MIN_RAYS, _MAX_WEIGHTS = 2048, 20_000
+# Lengths on rays are taken between these: beyond are only rays without an end.
+_SHORTEST, _LONGEST = 1e-30, 1e15
+
+_GRIDS: FieldCache[dict[Any, Any]] = FieldCache()
+
+
+class Network(Field):
+    """A neural network f: a multilayer perceptron that takes a point and gives one number, such as
+    a signed distance, that was fitted to a shape. Its surface is the level set f = level, and f is
+    smaller inside.
+
+    Each layer but the last computes a(W x + b) from the values x of the layer before, with an
+    activation function a; the last one is W x + b with a single row.
+
+    **All proofs are about the network**, not about the shape that it was fitted to. The module
+    `expansion` has them: along a ray f is a parabola up to remainders, which are bounded neuron by
+    neuron and weighted by a pass backwards. Weights are data: another network of about the same
+    size compiles nothing. In single precision the weights are rounded, which its errors include.
+
+    layers: a sequence of pairs (W, b) of arrays (m, k) and (m,). The first k is 3, and the last m
+        is 1; there are at least two layers, of at most 4,096 values.
+    activation: "relu", "tanh", "sine", "softplus" or "elu"; or a pair of such a name and its
+        parameter: ("sine", w0) is sin(w0 z), with w0 = 30 by default, ("softplus", beta) is
+        log(1 + exp(beta z))/beta, and ("elu", alpha) is alpha (exp z - 1) for z < 0, both with 1 by
+        default. Or a list of these, one for each layer but the last.
+    domain: a bounded volume in which f is drawn. None stands for the cube from -1 to 1, in which
+        networks are trained mostly.
+    level: the level that is drawn if the user names none.
+
+    Promises (proved bounds of f near a point): Lipschitz constants in balls of four sizes, from
+    ranges of the gradient (`expansion`), and the product of the norms of all layers everywhere.
+
+    Source: new in harnack. Sharp and Jacobson 2022 (Spelunking the Deep) bound networks in boxes
+        and along rays by affine arithmetic.
+
+    Raises:
+        ValueError: arrays of other shapes, NaN or infinity, another activation, or an unbounded
+            domain.
+        TypeError: layers that are no pairs of arrays of real numbers.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[tuple[Any, Any]],
+        *,
+        activation: Any = "relu",
+        domain: Volume | None = None,
+        level: float = 0.0,
+    ) -> None:
+        """Check the layers, and compute a bound of the gradient."""
+        self.layers = _checked_layers(layers)
+        self.activation = activation
+        self._activations = _checked_activations(activation, len(self.layers) - 1)
+        self.domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if domain is None else domain
+        lower, upper = self.domain.bounds()
+        if not np.isfinite([lower, upper]).all():
+            raise ValueError(
+                f"the domain of a network must be bounded, such as hk.Box(...), not {domain!r}"
+            )
+        self.default_level = self.level = float(level)
+        if not np.isfinite(self.level):
+            raise ValueError(f"level must be a finite number, not {level!r}")
+        bound = 1.0
+        for weights, _ in self.layers:
+            bound *= spectral_bound(weights)
+        for entry in self._activations:
+            bound *= entry.max_slope
+        self.lipschitz = bound * (1 + 1e-9)
+        kinks = any(entry.kink(entry.parameter) != 0 for entry in self._activations)
+        self.traits = Traits(over_relaxation=1.0, has_creases=kinks)
+        make_read_only(self.layers)
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        activation: Any = None,
+        domain: Volume | None = None,
+        level: float = 0.0,
+    ) -> Self:
+        """Read a network from a file of NumPy (.npz).
+
+        path: of the file. Its arrays are named by a layer and "weight" or "bias", in the order of
+            the numbers in the names: "0.weight", "0.bias", "2.weight", ... as in a state_dict of
+            PyTorch, or "weight_0", "bias_0", "weight_1", .... An array "activation" may hold the
+            name of the activation function, and "parameter" its number.
+        activation: as of `Network`; None for what the file says, or else "relu".
+        domain, level: as of `Network`.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: no .npz file, or no arrays with such names, or the errors of `Network`.
+        """
+        try:
+            archive = np.load(os.fspath(path), allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ValueError(f"{os.fspath(path)} is no .npz file of NumPy: {error}") from None
+        if not hasattr(archive, "files"):
+            raise ValueError(f"{os.fspath(path)} holds a single array: save layers by numpy.savez")
+        with archive:
+            arrays = {name: archive[name] for name in archive.files}
+        stored = str(arrays.pop("activation", "relu"))
+        if "parameter" in arrays:
+            stored = (stored, float(arrays.pop("parameter")))
+        layers = _layers_of_names(arrays, os.fspath(path))
+        return cls(
+            layers, activation=stored if activation is None else activation, domain=domain,
+            level=level,
+        )  # fmt: skip
+
+    @classmethod
+    def from_torch(cls, module: Any, *, domain: Volume | None = None, level: float = 0.0) -> Self:
+        """Take the weights of a torch.nn.Sequential of Linear layers with an activation between
+        each two: ReLU, Tanh, Softplus, ELU, or a module named Sine or SineLayer with an attribute
+        w0 or omega_0. Sequentials may be nested. PyTorch is not imported.
+
+        A Softplus of PyTorch is z itself beyond its threshold, by default 20, where this one
+        differs from it by less than exp(-20)/beta.
+
+        module: the module; later changes of it change nothing here.
+        domain, level: as of `Network`.
+
+        Raises:
+            TypeError: another kind of module, which is named.
+            ValueError: the modules are in another order, or the errors of `Network`.
+        """
+        layers, activations = layers_of_modules(module)
+        return cls(layers, activation=activations, domain=domain, level=level)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """The numbers of values of all layers, from the 3 coordinates to the 1 value."""
+        return (INPUTS, *(len(weights) for weights, _ in self.layers))
+
+    @property
+    def weight_count(self) -> int:
+        """The number of weights and biases."""
+        return sum(weights.size + bias.size for weights, bias in self.layers)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        return _NetworkEvaluator(self, plan, *self._upload(backend))
+
+    @cached_upload
+    def _upload(self, backend: Backend) -> tuple[LayerTables, Real, Real]:
+        """The tables on a backend; the Lipschitz constant; and the diagonal of the domain."""
+        assert self.domain is not None
+        lower, upper = self.domain.bounds()
+        return (
+            LayerTables.upload(backend, self.layers, self._activations),
+            dr.opaque(backend.Float, self.lipschitz * (1 + 1e-6)),
+            dr.opaque(backend.Float, float(np.linalg.norm(upper - lower))),
+        )
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A box around the coarse cells of the domain that may contain one of the levels; the
+        domain if none may."""
+        grid = self.cells(levels, _COARSE_CELLS)
+        centers = grid.occupied_centers()
+        if not len(centers) or self.domain is None:
+            return self.domain
+        lower, upper = self.domain.bounds()
+        half = 0.5001 * grid.cell_size
+        box = Box(
+            tuple(np.maximum(centers.min(axis=0) - half, lower).tolist()),
+            tuple(np.minimum(centers.max(axis=0) + half, upper).tolist()),
+        )
+        return box if isinstance(self.domain, Box) else self.domain & box
+
+    def cells(self, levels: tuple[float, ...], across: int) -> OccupancyGrid:
+        """The grid over the domain with about `across` cells along its longest side. Cells that
+        are not marked as occupied are proved to contain none of the levels. It is computed once
+        for the last levels."""
+        assert self.domain is not None
+        grids, domain = _GRIDS.get(self, levels, dict), self.domain
+        if across not in grids:
+            grids[across] = occupied_cells(self, levels, domain, across)
+        return grids[across]
+
+    def describe(self) -> dict[str, Any]:
+        """The shape of the network as a dictionary for users."""
+        kinds = [entry.name for entry in self._activations]
+        return {
+            "widths": self.widths,
+            "weights": self.weight_count,
+            "activations": kinds[0] if len(set(kinds)) == 1 else tuple(kinds),
+            "Lipschitz constant everywhere": self.lipschitz,
+        }
+
+
+def _checked_layers(layers: Any) -> tuple[Layer, ...]:
+    """The layers as arrays of double precision. Raises the errors of `Network`."""
+    if isinstance(layers, str | bytes) or not isinstance(layers, Iterable):
+        raise TypeError(
+            f"layers is a sequence of pairs (weights, bias) of arrays, not {type(layers).__name__}"
+        )
+    pairs: list[Any] = list(cast("Iterable[Any]", layers))
+    if len(pairs) < 2:
+        raise ValueError(f"a network needs at least two layers, not {len(pairs)}")
+    checked: list[Layer] = []
+    before = INPUTS
+    for index, pair in enumerate(pairs):
+        name = f"layer {index}"
+        if not isinstance(pair, Sequence) or len(cast("Sequence[Any]", pair)) != 2:
+            raise TypeError(
+                f"{name} is no pair (weights, bias): layers = [(W0, b0), (W1, b1), ...]"
+            )
+        weights, bias = (
+            np.array(as_real_array(part, f"{what} of {name}", type_error=TypeError), np.float64)
+            for part, what in zip(cast("Sequence[Any]", pair), ("weights", "bias"), strict=True)
+        )
+        if weights.ndim != 2 or weights.shape[1] != before or len(weights) == 0:
+            raise ValueError(
+                f"the weights of {name} must have shape (m, {before}), with a column for each "
+                f"{'coordinate' if index == 0 else 'value of the layer before'}, not "
+                f"{weights.shape}"
+            )
+        if bias.shape != (len(weights),):
+            raise ValueError(
+                f"the bias of {name} must have shape ({len(weights)},), not {bias.shape}"
+            )
+        if len(weights) > MAX_WIDTH:
+            raise ValueError(f"{name} has {len(weights):,} values, and may have {MAX_WIDTH:,}")
+        if not (np.isfinite(weights).all() and np.isfinite(bias).all()):
+            raise ValueError(f"{name} has weights that are NaN or infinite")
+        checked.append((weights, bias))
+        before = len(weights)
+    if before != 1:
+        raise ValueError(
+            f"the last layer must have one row, since a field has one value, not {before}"
+        )
+    return tuple(checked)
+
+
+def _checked_activations(choice: Any, count: int) -> tuple[Activation, ...]:
+    """The activation functions of all layers but the last."""
+    if not isinstance(choice, list):
+        return (activation_of(choice),) * count
+    choices = cast("list[Any]", choice)
+    if len(choices) != count:
+        raise ValueError(
+            f"a list of activations has one for each layer but the last, {count}, not "
+            f"{len(choices)}"
+        )
+    return tuple(activation_of(entry) for entry in choices)
+
+
+def _layers_of_names(arrays: dict[str, Any], path: str) -> list[tuple[Any, Any]]:
+    """The layers of arrays with names, in the order of the numbers in the names."""
+    layers: dict[str, dict[str, Any]] = {}
+    for name, array in arrays.items():
+        match = re.search(r"weight|bias", name)
+        if match is None:
+            raise ValueError(
+                f'{path} has an array {name!r}: names of layers contain "weight" or "bias", such '
+                "as 0.weight and 0.bias, or weight_0 and bias_0"
+            )
+        layer = name[: match.start()] + name[match.end() :]
+        layers.setdefault(layer, {})[match.group()] = array
+    for layer, parts in layers.items():
+        if len(parts) != 2:
+            (part,) = parts
+            raise ValueError(f"{path} has a {part} of layer {layer!r} and no other array of it")
+
+    def numbers(name: str) -> list[int]:
+        return [int(digits) for digits in re.findall(r"\d+", name)]
+
+    return [(layers[name]["weight"], layers[name]["bias"]) for name in sorted(layers, key=numbers)]
+
+
+@dataclass(frozen=True, eq=False)
+class _NetworkEvaluator(Evaluator):
+    """The evaluator of a network, which has the proofs in `expansion`.
+
+    field: the network.
+    plan: what it is used for.
+    tables: the weights.
+    lipschitz: a Lipschitz constant of f everywhere.
+    size: the diagonal of the domain.
+    """
+
+    field: Network
+    plan: Plan
+    tables: LayerTables
+    lipschitz: Real
+    size: Real
+
+    def evaluate(self, p: Vec3) -> Sample:
+        expansion = expand(self.tables, p, [self.size * part for part in _RADII], None)
+        norm = safe_norm(expansion.gradient) * (1 + 1e-5)
+        bounds = cast("tuple[BallBound, ...]", expansion.bounds)
+        balls = [Lipschitz(norm + bound.gradient_change, bound.radius) for bound in bounds]
+        return self._sample(expansion, (*balls, self._everywhere(p)))
+
+    def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
+        """The sample at the point of a ray with parameter t, with enclosures in front of it up to
+        the length `ahead` and up to a part of it. If the caller asks for other kinds of enclosures,
+        they follow from the sample at the point."""
+        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
+            return super().sample_ray(path, t, ahead, back)
+        p = path.point(t)
+        length = clamp(ahead, _SHORTEST, _LONGEST)
+        expansion = expand(self.tables, p, [length, _SHORTER * length], path.direction)
+        slope = dr.dot(expansion.gradient, path.direction)
+        rounding = 4 * self.tables.unit * safe_norm(expansion.gradient)
+        around = SlopeRange.around(slope, expansion.linear_error + rounding)
+        enclosures: list[ParabolaEnclosure] = []
+        for bound in cast("tuple[RayBound, ...]", expansion.bounds):
+            slopes = SlopeRange(around.lower + bound.lower_slope, around.upper + bound.upper_slope)
+            enclosures.append(
+                ParabolaEnclosure(slopes, bound.lower_second, bound.upper_second, bound.length)
+            )
+        sample = self._sample(expansion, (self._everywhere(p),))
+        return RaySample(sample, tuple(enclosures), (), slope, _REACH_GROWTH, expansion.slope_error)
+
+    def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
+        bounds = cast("tuple[BallBound, ...]", expand(self.tables, p, [radius], None).bounds)
+        return bounds[0].gradient_change
+
+    def occupied_cells(self) -> OccupancyGrid | None:
+        is_large = self.field.weight_count > _MAX_WEIGHTS
+        if is_large or not self.plan.levels or self.plan.ray_count < _MIN_RAYS:
+            return None
+        return self.field.cells(self.plan.levels, _CELLS)
+
+    def _everywhere(self, p: Vec3) -> Lipschitz:
+        """The Lipschitz constant everywhere."""
+        return Lipschitz(0 * p.x + self.lipschitz)
+
+    def _sample(self, expansion: Expansion, promises: tuple[Lipschitz, ...]) -> Sample:
+        """The sample of an expansion."""
+        return Sample(
+            expansion.value,
+            expansion.gradient,
+            promises,
+            expansion.value_error,
+            expansion.gradient_error,
+        )
