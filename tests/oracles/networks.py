@@ -1,3 +1,4 @@
+# pyright: reportUnknownVariableType=false
 """Neural networks in NumPy, in double precision, and first hits by dense sampling."""
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ import numpy as np
 
 def _activate(choice: Any, z: Any) -> tuple[Any, Any]:
     """An activation function and its slope."""
-    name, parameter = choice if isinstance(choice, tuple) else (choice, None)
+    pair: Any = choice if isinstance(choice, tuple) else (choice, None)
+    name, parameter = pair
     if name == "relu":
         return np.maximum(z, 0), 1.0 * (z > 0)
     if name == "tanh":
@@ -21,7 +23,8 @@ def _activate(choice: Any, z: Any) -> tuple[Any, Any]:
     if name == "softplus":
         return np.logaddexp(0, c * z) / c, 0.5 * (1 + np.tanh(0.5 * c * z))
     left = np.minimum(z, 0)
-    return np.where(z > 0, z, c * np.expm1(left)), np.where(z > 0, 1.0, c * np.exp(left))
+    slope: Any = np.where(z > 0, 1.0, c * np.exp(left))
+    return np.where(z > 0, z, c * np.expm1(left)), slope
 
 
 def network_value_and_gradient(
@@ -33,7 +36,7 @@ def network_value_and_gradient(
         z, jacobian = x @ weights.T + bias, weights @ jacobian
         if index == len(layers) - 1:
             return z[:, 0], jacobian[:, 0]
-        choice = activation[index] if isinstance(activation, list) else activation
+        choice: Any = activation[index] if isinstance(activation, list) else activation
         x, slope = _activate(choice, z)
         jacobian = jacobian * slope[:, :, None]
     raise AssertionError
@@ -44,7 +47,7 @@ def network_value(layers: list[tuple[Any, Any]], activation: Any, x: Any) -> Any
     for index, (weights, bias) in enumerate(layers):
         x = x @ weights.T + bias
         if index < len(layers) - 1:
-            choice = activation[index] if isinstance(activation, list) else activation
+            choice: Any = activation[index] if isinstance(activation, list) else activation
             x, _ = _activate(choice, x)
     return x[:, 0]
 

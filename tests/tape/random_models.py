@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 import harnack as hk
+from harnack.fields.solids.solid import Solid
 
 
-def random_part(rng: np.random.Generator, size: float) -> hk.Solid:
+def random_part(rng: np.random.Generator, size: float) -> Solid:
     """A random shape of about this size, moved and turned."""
     a, b, c = size * rng.uniform(0.3, 1.0, 3)
     kind = rng.integers(0, 6)
@@ -26,7 +27,7 @@ def random_part(rng: np.random.Generator, size: float) -> hk.Solid:
     return shape.translated(rng.uniform(-1, 1, 3))
 
 
-def random_model(rng: np.random.Generator, count: int, size: float = 0.4) -> hk.Solid:
+def random_model(rng: np.random.Generator, count: int, size: float = 0.4) -> Solid:
     """A random combination of `count` random shapes: unions, differences, intersections and blends,
     nested."""
     parts = [random_part(rng, size) for _ in range(count)]

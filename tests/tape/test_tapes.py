@@ -13,6 +13,7 @@ import harnack as hk
 from harnack.backend import choose_backend
 from harnack.fields import tape_evaluator
 from harnack.fields.batched_fields import FieldCache
+from harnack.fields.solids.solid import Solid
 from harnack.tape.cells import TapeCells
 from harnack.tape.pruning import BoxLimits, BoxTapes
 from harnack.tape.recording import Tape, record
@@ -102,7 +103,7 @@ def test_cells_have_the_values_that_matter(seed: int, levels: tuple[float, ...])
             assert not any(abs(exact[k] - level) < 1e-12 for level in levels)
     assert levels or not is_empty.any()
     lengths = cells.lists.lengths[cells.list_of_cell]
-    assert lengths.mean() < 0.4 * len(tape)
+    assert lengths.mean() < (0.4 if levels else 0.6) * len(tape)
 
 
 def fresh_caches(monkeypatch: pytest.MonkeyPatch, shortest: int) -> None:
@@ -153,7 +154,7 @@ def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
     """Radii, places, the number of parts and how they are combined are data."""
     rng = np.random.default_rng(3)
 
-    def model(count: int) -> hk.Solid:
+    def model(count: int) -> Solid:
         centers = rng.uniform(-1, 1, (count, 3))
         return hk.solids.union(*(hk.Sphere(0.1, tuple(c)) for c in centers.tolist()))
 

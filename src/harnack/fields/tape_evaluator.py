@@ -24,7 +24,7 @@ from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaOnRay
 from harnack.tape.cells import CELL_MARGIN, TapeCells
 from harnack.tape.interpreter import TapeProgram
-from harnack.tape.operations import COORDINATE_COUNT
+from harnack.tape.operations import COORDINATE_COUNT, Operation
 from harnack.tape.pruning import BoxTapes
 from harnack.tape.recording import Tape, record
 from harnack.tree.empty_space import EmptySpaceGrid, OccupancyGrid
@@ -242,8 +242,12 @@ class TapeEvaluator(FormulaEvaluator):
     def may_jump(self) -> bool:
         return self.tally.may_jump
 
-    @functools.cached_property
+    @property
     def is_abrupt(self) -> bool:
+        return self._is_abrupt
+
+    @functools.cached_property
+    def _is_abrupt(self) -> bool:
         return _is_abrupt(self.field, self.tally)
 
     @property
@@ -352,11 +356,14 @@ def _tally_of_tape(tape: Tape) -> Tally:
     """The summary of the operations of a tape."""
     tally = Tally()
     numbers: list[Any] = [OperationCounter(tally) for _ in range(COORDINATE_COUNT)]
-    rows = zip(tape.kinds.tolist(), tape.operands.tolist(), tape.constants.tolist(), strict=True)
+    rows: Any = zip(
+        tape.kinds.tolist(), tape.operands.tolist(), tape.constants.tolist(), strict=True
+    )
+    operation: Operation
     for kind, operands, constants in rows:
         if kind < 0:
             continue
-        operation = tape.operations[kind]
+        operation = tape.operations[int(kind)]
         counters = [numbers[k] for k in operands[: operation.operand_count]]
         values = [numbers[0].constant(c) for c in constants[: operation.constant_count]]
         numbers.append(operation.apply(counters, values))

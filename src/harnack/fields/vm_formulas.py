@@ -10,6 +10,7 @@ The result of the last line is the value of the formula. Lines that begin with #
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from harnack import arithmetic
+from harnack.arithmetic.functions import reciprocal
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
@@ -28,19 +30,17 @@ __all__ = ["VmFormula"]
 _MAX_BYTES = 64_000_000
 _COORDINATES = ("var-x", "var-y", "var-z")
 # For each operation the number of its operands, and the function.
-_OPERATIONS: Mapping[str, tuple[int, Callable[..., Any]]] = MappingProxyType(
-    {
-        "neg": (1, lambda a: -a), "square": (1, lambda a: a * a), "abs": (1, arithmetic.absolute),
-        "recip": (1, arithmetic.reciprocal), "sqrt": (1, arithmetic.sqrt),
-        "sin": (1, arithmetic.sin), "cos": (1, arithmetic.cos), "tan": (1, arithmetic.tan),
-        "asin": (1, arithmetic.asin), "acos": (1, arithmetic.acos), "atan": (1, arithmetic.atan),
-        "exp": (1, arithmetic.exp), "log": (1, arithmetic.log), "ln": (1, arithmetic.log),
-        "add": (2, lambda a, b: a + b), "sub": (2, lambda a, b: a - b),
-        "mul": (2, lambda a, b: a * b), "div": (2, lambda a, b: a / b),
-        "max": (2, arithmetic.maximum), "min": (2, arithmetic.minimum),
-        "atan2": (2, arithmetic.atan2),
-    }
-)  # fmt: skip
+_FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "neg": (1, operator.neg), "square": (1, arithmetic.power(2)), "abs": (1, arithmetic.absolute),
+    "recip": (1, reciprocal), "sqrt": (1, arithmetic.sqrt),
+    "sin": (1, arithmetic.sin), "cos": (1, arithmetic.cos), "tan": (1, arithmetic.tan),
+    "asin": (1, arithmetic.asin), "acos": (1, arithmetic.acos), "atan": (1, arithmetic.atan),
+    "exp": (1, arithmetic.exp), "log": (1, arithmetic.log), "ln": (1, arithmetic.log),
+    "add": (2, operator.add), "sub": (2, operator.sub), "mul": (2, operator.mul),
+    "div": (2, operator.truediv), "max": (2, arithmetic.maximum),
+    "min": (2, arithmetic.minimum), "atan2": (2, arithmetic.atan2),
+}  # fmt: skip
+_OPERATIONS = MappingProxyType(_FUNCTIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class VmFormula:
         coordinates = dict(zip(_COORDINATES, (x, y, z), strict=True))
         results: list[Any] = []
         for operation, operands in self.instructions:
-            if isinstance(operands, float):
+            if not isinstance(operands, tuple):
                 results.append(operands)
             elif operation in coordinates:
                 results.append(coordinates[operation])
@@ -136,7 +136,7 @@ def _instruction(
             value = math.nan
         if not math.isfinite(value):
             raise ValueError("const is followed by one finite number")
-        return operation, value
+        return operation, float(value)
     if operation not in _COORDINATES and operation not in _OPERATIONS:
         known = ("const", *_COORDINATES, *_OPERATIONS)
         raise ValueError(

@@ -81,7 +81,7 @@ class TapeCells(GridData):
         shape = np.ceil((upper + 0.25 * _BORDER * longest - origin) / size).astype(np.int64)
         blocks = -(-shape // 2**depth)
         octree = _Octree(origin, size, levels)
-        indices = np.indices(blocks).reshape(3, -1).T
+        indices: IntArray = np.indices(tuple(blocks.tolist())).reshape(3, -1).T
         lists = BoxTapes.whole(tape).subset(np.zeros(len(indices), np.int64))
         limits = BoxLimits.unlimited(len(indices), levels)
         for rest in range(depth, -1, -1):

@@ -22,7 +22,7 @@ from harnack.backend.record_table import RecordTable
 from harnack.tape.operations import COORDINATE_COUNT, MAX_CONSTANTS
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Index, IntArray, Real
+    from harnack.backend import Backend, BoolArray, FloatArray, Index, IntArray, Real
     from harnack.tape.operations import Operation
     from harnack.tape.pruning import BoxTapes
 
@@ -105,32 +105,37 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
             f"{_MAX_SLOTS:,}: write it as sums and minima of parts that are computed one after "
             "another"
         )
-    kinds = tape.kinds[instructions]
+    kinds: Any = tape.kinds[instructions]
     arities = np.array([0 if o.is_of_point else o.operand_count for o in tape.operations])
     arity = np.where(kinds >= 0, arities[kinds], 0)
     is_run = kinds >= 0
     # Whether an operand is the result of the entry before, which is in the same list.
-    is_before = [(column == entries - 1) & (kinds[column] >= 0) for column in lists.operands]
+    is_before: list[BoolArray] = [
+        (column == entries - 1) & (kinds[column] >= 0) for column in lists.operands
+    ]
     is_last = np.zeros(count, np.bool_)
     is_last[lists.results] = True
     # Which operand is read from local memory, and which one by an instruction of its own. A list
     # that consists of a coordinate reads it.
-    first, second, third = lists.operands
-    is_twice = (arity == 2) & (second == first)
+    columns: Any = lists.operands
+    first, second, third = columns
+    is_twice: BoolArray = (arity == 2) & (second == first)
     reads_first = ((arity >= 1) & ~is_before[0]) | (arity == 3)
-    reads_second = (arity == 2) & np.where(is_twice, reads_first, is_before[0])
-    loads = (arity >= 2) & ~is_before[1] & ~reads_second
+    reads_second: Any = (arity == 2) & np.where(is_twice, reads_first, is_before[0])
+    loads: Any = (arity >= 2) & ~is_before[1] & ~reads_second
     is_plain_load = ~is_run & is_last
     loaded = np.where(loads, second, entries)
-    operand = np.where(reads_second, second, first)
-    reads = reads_first | reads_second
+    operand: Any = np.where(reads_second, second, first)
+    reads: Any = reads_first | reads_second
     is_written = np.zeros(count, np.bool_)
     is_written[operand[reads]] = True
     is_written[third[arity == 3]] = True
     is_written[loaded[loads]] = True
     row_of = np.unique(tape.constants, axis=0, return_inverse=True)[1].reshape(-1)
-    flags = _READS * reads + _FIRST * reads_first + _SECOND * reads_second + _WRITES * is_written
-    own = np.stack(
+    flags: Any = (
+        _READS * reads + _FIRST * reads_first + _SECOND * reads_second + _WRITES * is_written
+    )
+    own: Any = np.stack(
         [
             kinds | slots << _SLOT_BITS,
             slots[operand] | slots[third] << _SLOT_BITS,
@@ -149,7 +154,7 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
         axis=1,
     )
     both = np.stack([load, own], axis=1).reshape(-1, _WORDS)
-    is_present = np.stack([loads | is_plain_load, is_run], axis=1)
+    is_present: Any = np.stack([loads | is_plain_load, is_run], axis=1)
     before = np.concatenate([[0], np.cumsum(is_present.sum(axis=1))])
     return both[is_present.ravel()], before, slot_count
 
@@ -193,7 +198,7 @@ class TapeFormula:
         numbers = unpack(packed)
         memory = self._memory(layouts, numbers, zero)
         calls = [self._call(operation, layouts, unpack) for operation in program.operations]
-        calls.append(lambda first, second, third, constants, packed: first)
+        calls.append(_first)
         has_third = any(o.operand_count > 2 and not o.is_of_point for o in program.operations)
         mask = (1 << _SLOT_BITS) - 1
         word_type = dr.uint32_array_t(backend.Array4f)
@@ -217,9 +222,12 @@ class TapeFormula:
 
         start = self.begin + backend.UInt32(0 * zero)
         last = [zero for _ in memory]
-        _, parts, _ = dr.while_loop(
-            (start, last, memory), lambda k, last, memory: k < self.end, body, label="tape"
-        )
+
+        def is_running(k: Any, *_: Any) -> Any:
+            """Whether there is an instruction k in the list of each lane."""
+            return k < self.end
+
+        _, parts, _ = dr.while_loop((start, last, memory), is_running, body, label="tape")
         return _numbers_of_parts(layouts, parts, numbers)
 
     def _memory(self, layouts: list[_Layout], numbers: list[Any], zero: Real) -> list[Any]:
@@ -275,6 +283,11 @@ class TapeFormula:
             return [like.constant(number) for number in low]
         high = constants[MAX_CONSTANTS : MAX_CONSTANTS + operation.constant_count]
         return [like.constant_between(*ends) for ends in zip(low, high, strict=True)]
+
+
+def _first(first: list[Real], *_: Any) -> list[Real]:
+    """The operation that reads an operand from local memory."""
+    return first
 
 
 def _numbers_of_parts(

@@ -485,7 +485,7 @@ def blend_operation(exponent: float, *, is_union: bool) -> Operation:
         return blend(a, b, constants[0], exponent)
 
     def ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
-        low, high = _monotone(lambda a, b, r: blend(a, b, r, exponent))(operands, constants)
+        low, high = _monotone(functools.partial(blend, power=exponent))(operands, constants)
         # The terms may be as large as the radius.
         slack = 1e-14 * np.abs(constants[0])
         return low - slack, high + slack

@@ -14,15 +14,22 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from harnack.tape.operations import COORDINATE_COUNT
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.tape.recording import Tape
+
+EntryArray: TypeAlias = (
+    "npt.NDArray[np.int32] | npt.NDArray[np.int64] | npt.NDArray[np.int32 | np.int64]"
+)
+"""Indices of entries of lists, which are many: 32 bits save memory and time."""
 
 __all__ = ["BoxLimits", "BoxTapes", "PrunedTapes"]
 
@@ -96,8 +103,8 @@ class BoxTapes:
 
     tape: Tape
     starts: IntArray
-    instructions: IntArray
-    operands: IntArray
+    instructions: EntryArray
+    operands: EntryArray
 
     @classmethod
     def whole(cls, tape: Tape) -> BoxTapes:
@@ -150,7 +157,7 @@ class BoxTapes:
         )
 
     @functools.cached_property
-    def _groups(self) -> list[tuple[int, IntArray]]:
+    def _groups(self) -> list[tuple[int, EntryArray]]:
         """The entries, in groups with the same operation, each group after those of its operands:
         pairs of the index of the operation (-1 for coordinates) and the entries (k,)."""
         kinds = self.tape.kinds[self.instructions]
@@ -163,13 +170,13 @@ class BoxTapes:
         groups = np.split(order, borders)
         return [(int(kinds[group[0]]), group) for group in groups]
 
-    def _operand_columns(self, kind: int, group: IntArray) -> list[IntArray]:
+    def _operand_columns(self, kind: int, group: EntryArray) -> list[EntryArray]:
         """The operands (k,) of the entries of a group: an array for each operand of the
         operation."""
         count = self.tape.operations[kind].operand_count
         return [column[group] for column in self.operands[:count]]
 
-    def _constant_columns(self, kind: int, group: IntArray) -> list[FloatArray]:
+    def _constant_columns(self, kind: int, group: EntryArray) -> list[FloatArray]:
         """The constants (k,) of the entries of a group: an array for each of the operation's."""
         instructions = self.instructions[group]
         count = self.tape.operations[kind].constant_count
@@ -216,7 +223,7 @@ class BoxTapes:
 
     def _replacements(
         self, low: FloatArray, high: FloatArray, limits_of_boxes: BoxLimits
-    ) -> tuple[IntArray, BoolArray]:
+    ) -> tuple[EntryArray, BoolArray]:
         """For each entry (n,) the entry by which it is replaced, mostly itself; and whether the
         last entry of its list still needs it (n,). low, high: (n,) the ranges of the entries."""
         count = len(self.instructions)

@@ -8,7 +8,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -65,9 +65,18 @@ class Tape:
     def depths(self) -> IntArray:
         """For each instruction (n,) the length of the longest chain of operands below it."""
         depths = [0] * len(self)
-        for k, operands in enumerate(self.operands.tolist()):
+        rows: Any = self.operands.tolist()
+        for k, operands in enumerate(rows):
             depths[k] = 1 + max((depths[j] for j in operands if j >= 0), default=-1)
         return np.array(depths, np.int64)
+
+
+_Row: TypeAlias = "tuple[int, tuple[int, ...], tuple[float, ...]]"
+
+
+def _coordinate_rows() -> list[_Row]:
+    """The rows of the coordinates, which have no operation."""
+    return [(-1, (), ()) for _ in range(COORDINATE_COUNT)]
 
 
 @dataclass(eq=False)
@@ -76,9 +85,7 @@ class _Recorder:
     once."""
 
     operations: list[Operation] = field(default_factory=list[Operation])
-    rows: list[tuple[int, tuple[int, ...], tuple[float, ...]]] = field(
-        default_factory=lambda: [(-1, (), ())] * COORDINATE_COUNT
-    )
+    rows: list[_Row] = field(default_factory=_coordinate_rows)
     kind_of: dict[str, int] = field(default_factory=dict[str, int])
     index_of: dict[Any, int] = field(default_factory=dict[Any, int])
 
@@ -308,14 +315,18 @@ class TapeNumber(FormulaNumber):
         return self._instruction(norm_operation(len(values), p), values)
 
     def of_several(self, name: str, values: Sequence[Any], *literals: float) -> TapeNumber | None:
-        numbers = [self.coerce(value) for value in values]
+        numbers: list[TapeNumber] = [self.coerce(value) for value in values]
         if name == "norm":
             return self._norm(numbers, *literals)
         if name in ("maximum", "minimum"):
             # A balanced tree: in a chain a box would decide one operand after another.
+            operation = operation_named(name)
             while len(numbers) > 1:
                 pairs = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
-                numbers = [getattr(p[0], name)(p[1]) if len(p) > 1 else p[0] for p in pairs]
+                numbers = [
+                    self._instruction(operation, pair) if len(pair) > 1 else pair[0]
+                    for pair in pairs
+                ]
             return numbers[0]
         if name == "orthogonal intersection":
             count = len(numbers)
@@ -354,4 +365,4 @@ def record(formula: Callable[[Any, Any, Any], Any]) -> Tape:
         value = x.coerce(formula(x, y, z))
     except (AttributeError, RuntimeError) as error:
         raise TypeError(f"the formula cannot be recorded: {error}") from error
-    return recorder.tape(cast("TapeNumber", value).index)
+    return recorder.tape(value.index)
