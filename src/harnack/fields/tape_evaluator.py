@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["TapeEvaluator", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted; shorter ones are compiled.
-_MIN_INSTRUCTIONS = 40
+_MIN_INSTRUCTIONS = 20
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
 # along a ray; where that is more than a quarter of the margin of cells, the whole list is run.
 _ROUNDINGS = 512.0
@@ -201,14 +201,14 @@ class _Block:
         nearest = nearest + 0.5 * self.grid.margin
         return dr.select(self.is_valid, nearest * self.grid.cell_size, dr.inf)
 
-    def exact(self, program: TapeProgram, p: Vec3) -> _Block:
+    def exact(self, program: TapeProgram, p: Vec3, active: Mask) -> _Block:
         """The block, or the whole tape where the value at p is not within the limits of its
         list."""
         if self.grid.floors is None:
             return self
         zero = 0 * p.x
         numbers = [Jet(Interval.point(p[k]), (), (), piece_length=zero) for k in range(3)]
-        value = program.formula(self.index)(*numbers).value
+        value = program.formula(self.index, active & self.is_valid)(*numbers).value
         kind = self.grid.backend.Float
         floor, cap = (dr.gather(kind, a, self.index) for a in (self.grid.floors, self.grid.caps))
         is_valid = self.is_valid & (value.lower > floor) & (value.upper < cap)
@@ -263,8 +263,11 @@ class TapeEvaluator(FormulaEvaluator):
         grid, program = self.uploaded.grid, self.uploaded.program
         if grid is None:
             return self._with_list(self.formula, None)
-        block = grid.block_at(p, 0.0 * p.x).exact(program, p)
-        return self._with_list(program.formula(block.index), block.border_distance())
+        # Points that are no numbers, as those of rays without a hit, need no list.
+        is_number = dr.isfinite(p.x + p.y + p.z)
+        block = grid.block_at(p, 0.0 * p.x).exact(program, p, is_number)
+        formula = program.formula(block.index, is_number)
+        return self._with_list(formula, block.border_distance())
 
     def evaluate(self, p: Vec3) -> Sample:
         return self._at(p).evaluate(p)

@@ -79,13 +79,17 @@ class TapeProgram:
             max(_MIN_SLOTS, 1 << (count - 1).bit_length()),
         )
 
-    def formula(self, index: Any) -> TapeFormula:
-        """The formula of a list for each lane. index: of the list; an integer for all lanes."""
+    def formula(self, index: Any, active: Any = True) -> TapeFormula:
+        """The formula of a list for each lane.
+
+        index: of the list; an integer for all lanes.
+        active: the lanes on which it is computed; on others its values are NaN.
+        """
         index = self.backend.UInt32(index)
-        kind = self.backend.UInt32
-        return TapeFormula(
-            self, dr.gather(kind, self.begins, index), dr.gather(kind, self.ends, index)
+        begin, end = (
+            dr.gather(self.backend.UInt32, array, index) for array in (self.begins, self.ends)
         )
+        return TapeFormula(self, begin, end if active is True else dr.select(active, end, begin))
 
 
 def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
@@ -221,7 +225,7 @@ class TapeFormula:
             return k + 1, parts, memory
 
         start = self.begin + backend.UInt32(0 * zero)
-        last = [zero for _ in memory]
+        last = [zero + dr.nan for _ in memory]
 
         def is_running(k: Any, *_: Any) -> Any:
             """Whether there is an instruction k in the list of each lane."""
