@@ -3,6 +3,7 @@ formulas themselves."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -167,3 +168,14 @@ def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     assert kernels
     assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
+
+
+def test_pages_compile_models_or_refuse_them(tmp_path: Path) -> None:
+    """Kernels of pages are translated, which calls and local memory are not."""
+    centers = np.random.default_rng(4).uniform(-1, 1, (400, 3)).tolist()
+    spheres = [hk.Sphere(0.3, tuple(c)) for c in centers]
+    with pytest.raises(NotImplementedError, match="instructions takes minutes to compile"):
+        hk.page(hk.solids.union(*spheres), tmp_path / "a.html")
+    assert not list(tmp_path.iterdir())
+    hk.page(hk.solids.union(*spheres[:8]), tmp_path / "a.html")
+    assert (tmp_path / "a.html").stat().st_size > 10_000

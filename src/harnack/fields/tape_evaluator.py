@@ -6,6 +6,9 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
+from collections.abc import Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -35,13 +38,30 @@ if TYPE_CHECKING:
     from harnack.fields.evaluator import Plan
     from harnack.fields.field import Field
 
-__all__ = ["TapeEvaluator", "recorded_tape", "tape_evaluator"]
+__all__ = ["TapeEvaluator", "compiled_formulas", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted; shorter ones are compiled.
 _MIN_INSTRUCTIONS = 20
+# Formulas of more instructions are not compiled, even where they cannot be interpreted.
+_MAX_COMPILED = 1_000
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
 # along a ray; where that is more than a quarter of the margin of cells, the whole list is run.
 _ROUNDINGS = 512.0
+
+
+# Whether formulas are compiled, whatever their length (`compiled_formulas`).
+_ONLY_COMPILED: ContextVar[bool] = ContextVar("compiled_formulas", default=False)
+
+
+@contextmanager
+def compiled_formulas() -> Generator[None]:
+    """A context within which formulas of any length are compiled: for kernels that are translated
+    for other GPUs, as calls of functions and arrays of local memory are not."""
+    token = _ONLY_COMPILED.set(True)
+    try:
+        yield
+    finally:
+        _ONLY_COMPILED.reset(token)
 
 
 # For each field its tape, and its cells by levels.
@@ -69,9 +89,20 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
     """The evaluator of a field by its tape; None if its formula is short, or cannot be recorded.
 
     field: a field with a method `formula`.
+
+    Raises:
+        NotImplementedError: a formula that must be compiled (`compiled_formulas`) is too long.
     """
     tape = recorded_tape(field)
     if tape is None or len(tape) <= _MIN_INSTRUCTIONS:
+        return None
+    if _ONLY_COMPILED.get():
+        if len(tape) > _MAX_COMPILED:
+            raise NotImplementedError(
+                f"a formula of {len(tape):,} instructions takes minutes to compile, and pages and "
+                "other GPUs cannot interpret it yet: render it here, or show its mesh "
+                "(harnack.mesh)"
+            )
         return None
     uploaded: _UploadedTape = _upload(field, backend, plan.levels)
     lipschitz = getattr(field, "lipschitz", None)
