@@ -170,12 +170,19 @@ def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
     assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
 
 
-def test_pages_compile_models_or_refuse_them(tmp_path: Path) -> None:
+def test_pages_refuse_models_that_compile_for_minutes(tmp_path: Path) -> None:
     """Kernels of pages are translated, which calls and local memory are not."""
     centers = np.random.default_rng(4).uniform(-1, 1, (400, 3)).tolist()
     spheres = [hk.Sphere(0.3, tuple(c)) for c in centers]
     with pytest.raises(NotImplementedError, match="instructions takes minutes to compile"):
         hk.page(hk.solids.union(*spheres), tmp_path / "a.html")
     assert not list(tmp_path.iterdir())
-    hk.page(hk.solids.union(*spheres[:8]), tmp_path / "a.html")
+
+
+@pytest.mark.slow
+def test_pages_compile_short_models(tmp_path: Path) -> None:
+    centers = np.random.default_rng(4).uniform(-1, 1, (10, 3)).tolist()
+    model = hk.solids.union(*(hk.Sphere(0.3, tuple(c)) for c in centers))
+    assert isinstance(model.evaluator(choose_backend("single")), tape_evaluator.TapeEvaluator)
+    hk.page(model, tmp_path / "a.html")
     assert (tmp_path / "a.html").stat().st_size > 10_000

@@ -40,10 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["TapeEvaluator", "compiled_formulas", "recorded_tape", "tape_evaluator"]
 
-# Formulas of more instructions are interpreted; shorter ones are compiled.
-_MIN_INSTRUCTIONS = 20
+# Formulas of more instructions are interpreted, and combinations of more than half as many, since
+# much of them is left out in each cell; shorter ones are compiled.
+_MIN_INSTRUCTIONS = 40
 # Formulas of more instructions are not compiled, even where they cannot be interpreted.
-_MAX_COMPILED = 1_000
+_MAX_COMPILED = 300
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
 # along a ray; where that is more than a quarter of the margin of cells, the whole list is run.
 _ROUNDINGS = 512.0
@@ -94,7 +95,8 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
         NotImplementedError: a formula that must be compiled (`compiled_formulas`) is too long.
     """
     tape = recorded_tape(field)
-    if tape is None or len(tape) <= _MIN_INSTRUCTIONS:
+    shortest = _MIN_INSTRUCTIONS if hasattr(type(field), "tally") else _MIN_INSTRUCTIONS // 2
+    if tape is None or len(tape) <= shortest:
         return None
     if _ONLY_COMPILED.get():
         if len(tape) > _MAX_COMPILED:
