@@ -10,7 +10,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -95,7 +95,9 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
         NotImplementedError: a formula that must be compiled (`compiled_formulas`) is too long.
     """
     tape = recorded_tape(field)
-    shortest = _MIN_INSTRUCTIONS if hasattr(type(field), "tally") else _MIN_INSTRUCTIONS // 2
+    shortest = (
+        _MIN_INSTRUCTIONS if hasattr(cast("Any", type(field)), "tally") else _MIN_INSTRUCTIONS // 2
+    )
     if tape is None or len(tape) <= shortest:
         return None
     if _ONLY_COMPILED.get():

@@ -129,7 +129,7 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     loads: Any = (arity >= 2) & ~is_before[1] & ~reads_second
     is_plain_load = ~is_run & is_last
     loaded = np.where(loads, second, entries)
-    operand: Any = np.where(reads_second, second, first)
+    operand: IntArray = np.asarray(np.where(reads_second, second, first), np.int64)
     reads: Any = reads_first | reads_second
     is_written = np.zeros(count, np.bool_)
     is_written[operand[reads]] = True

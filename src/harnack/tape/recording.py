@@ -65,7 +65,7 @@ class Tape:
     def depths(self) -> IntArray:
         """For each instruction (n,) the length of the longest chain of operands below it."""
         depths = [0] * len(self)
-        rows: Any = self.operands.tolist()
+        rows: list[list[int]] = self.operands.tolist()
         for k, operands in enumerate(rows):
             depths[k] = 1 + max((depths[j] for j in operands if j >= 0), default=-1)
         return np.array(depths, np.int64)
