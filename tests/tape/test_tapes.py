@@ -147,6 +147,10 @@ def test_first_hits_are_those_of_the_compiled_formula(
     later = by_tape.t[both] - compiled.t[both]
     assert (np.abs(later) < 2e-3).mean() > 0.99
     assert np.abs(model.value(by_tape.position[both])).max() < 1e-3
+    # No solid before the first hit, or on rays that miss.
+    end = np.where(np.isfinite(by_tape.t), by_tape.t - 5e-3, 8.0)
+    for share in np.linspace(0.0, 1.0, 60):
+        assert model.value(o + (share * end)[:, None] * d).min() > -2e-3
     assert not (by_tape.status == hk.RayStatus.OUT_OF_STEPS).any()
 
 
