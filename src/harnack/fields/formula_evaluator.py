@@ -307,7 +307,7 @@ class FormulaEvaluator(Evaluator):
             function = function.rounded(t)
         enclosures = path.proofs.from_restriction(function, slopes, ahead)
         if not enclosures:
-            return path.enclose(sample)
+            return self.enclose_by_promises(path, p, sample)
         # A `PiecewiseTaylorEnclosure` proves nothing on a piece whose slopes are unbounded. The
         # other kinds assume that f is continuous, so they are made only for a length on which that
         # is proved.
@@ -326,6 +326,12 @@ class FormulaEvaluator(Evaluator):
         # numbers into Dr.Jit arrays.)
         min_norm = safe_norm(type(p)(*(0 * p.x + entry.min_abs for entry in jet.first_derivatives)))
         return RaySample(sample, enclosures, (), slope, growth, slope_error, min_norm)
+
+    def enclose_by_promises(self, path: Ray, p: Vec3, sample: Sample) -> RaySample:
+        """The ray sample at the points p of rays that follows from promises alone. sample: that at
+        p."""
+        del p
+        return path.enclose(sample)
 
     def _slope(self, p: Vec3, direction: Vec3, *, is_rounded: bool = False) -> tuple[Real, Real]:
         """The derivative of f at p along a direction, and a bound of its error. It is computed from

@@ -6,7 +6,7 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.arithmetic import Interval, Jet
-from harnack.arithmetic.operators import OperationCounter, Tally
+from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.elementary import fmin, max_norm, safe_norm
 from harnack.enclosures import SlopeRange
@@ -24,10 +24,10 @@ from harnack.enclosures.enclosure import PathPiece
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import RaySample
 from harnack.fields.batched_fields import FieldCache, cached_upload
+from harnack.fields.field import Field
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaOnRay
 from harnack.tape.cells import CELL_MARGIN, TapeCells
-from harnack.tape.interpreter import TapeProgram
-from harnack.tape.operations import COORDINATE_COUNT, Operation
+from harnack.tape.interpreter import TapeProgram, rounded_ends
 from harnack.tape.pruning import BoxTapes
 from harnack.tape.recording import Tape, record
 from harnack.tree.empty_space import EmptySpaceGrid, OccupancyGrid
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Index, Mask, Real, Vec3
     from harnack.enclosures.samples import Ray, Sample
     from harnack.fields.evaluator import Plan
-    from harnack.fields.field import Field
 
 __all__ = ["TapeEvaluator", "compiled_formulas", "recorded_tape", "tape_evaluator"]
 
@@ -112,7 +111,7 @@ def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | 
     lipschitz = getattr(field, "lipschitz", None)
     constant = dr.opaque(backend.Float, float(lipschitz)) if lipschitz is not None else None
     whole = uploaded.program.formula(dr.opaque(backend.UInt32, 0))
-    return TapeEvaluator(field, whole, constant, uploaded, tape)
+    return TapeEvaluator(field, whole, constant, uploaded)
 
 
 @cached_upload
@@ -178,7 +177,10 @@ class _CellGrid(EmptySpaceGrid):
         lists, sides = (upload_integers(backend, a) for a in (cells.list_of_cell, cells.sides))
         if not limits.levels:
             return cls(*layout, CELL_MARGIN, lists, sides, None, None)
-        floors, caps = (upload_floats(backend, a) for a in (limits.floor, limits.cap))
+        # Rounded inwards.
+        _, floors = rounded_ends(backend, limits.floor)
+        caps, _ = rounded_ends(backend, limits.cap)
+        floors, caps = (upload_floats(backend, a) for a in (floors, caps))
         return cls(*layout, CELL_MARGIN, lists, sides, floors, caps)
 
     def block_at(self, p: Vec3, t: Real) -> _Block:
@@ -260,34 +262,30 @@ class TapeEvaluator(FormulaEvaluator):
     ends there. The other half is for rounding, which `block_at` compares with it. Samples on rays
     are of the function of the list, which takes a level where the formula does, and is the same
     near it. Samples at points, which are used for more than levels, are of the formula itself:
-    where the value of a list may differ from it, the whole tape is run.
+    where the value of a list may differ from it, the whole tape is run. So are samples on rays if
+    their enclosures follow from promises: these hold for f, and beyond the cell.
 
     uploaded: the lists.
-    tape: the whole tape.
     """
 
     uploaded: _UploadedTape
-    tape: Tape
 
     @functools.cached_property
-    def tally(self) -> Tally:
-        return _tally_of_tape(self.tape)
+    def _tallies(self) -> tuple[tuple[Tally, float], ...]:
+        """The tallies of the parts of f (`_tallies_of`)."""
+        return tuple(_tallies_of(self.field))
 
     @functools.cached_property
     def may_jump(self) -> bool:
-        return self.tally.may_jump
+        return any(tally.may_jump for tally, _ in self._tallies)
 
     @property
     def is_abrupt(self) -> bool:
-        return self._is_abrupt
-
-    @functools.cached_property
-    def _is_abrupt(self) -> bool:
-        return _is_abrupt(self.field, self.tally)
+        return any(tally.turns_within(finest) for tally, finest in self._tallies)
 
     @property
-    def is_convex(self) -> bool:
-        return getattr(self.field, "is_convex", False)
+    def is_steep(self) -> bool:
+        return self.is_abrupt or any(tally.is_steep for tally, _ in self._tallies)
 
     def _with_list(self, formula: Any, radius: Real | None) -> FormulaEvaluator:
         """The evaluator of a formula that is valid within a radius; None for everywhere."""
@@ -322,7 +320,7 @@ class TapeEvaluator(FormulaEvaluator):
             near = self._with_list(formula, block.border_distance())
             ahead = fmin(ahead, block.exit_length(d))
         uses_ranges = PiecewiseTaylorEnclosure in path.proofs.kinds
-        if self.may_jump or self.is_abrupt or self.is_convex or not uses_ranges:
+        if self.may_jump or self.is_abrupt or near.is_convex or not uses_ranges:
             return near.sample_ray(path, t, ahead, back)
         # As there, with a single loop for the jets at the point and on the ray.
         formula: Any = near.formula
@@ -370,10 +368,6 @@ class _ListEvaluator(FormulaEvaluator):
         return self.parent.name
 
     @property
-    def tally(self) -> Tally:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.parent.tally
-
-    @property
     def may_jump(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.parent.may_jump
 
@@ -383,41 +377,31 @@ class _ListEvaluator(FormulaEvaluator):
 
     @property
     def is_convex(self) -> bool:
-        return self.parent.is_convex
+        """Whether f is convex and the whole tape is run: a tangent to the function of a list bounds
+        f neither from a point where it is not f, nor beyond the cell."""
+        return self.radius is None and getattr(self.field, "is_convex", False)
+
+    def enclose_by_promises(self, path: Ray, p: Vec3, sample: Sample) -> RaySample:
+        """The ray sample that follows from the promises of f itself (`TapeEvaluator`)."""
+        return super().enclose_by_promises(path, p, self.parent.evaluate(p))
 
     @property
     def max_radius(self) -> Real:
         return super().max_radius if self.radius is None else fmin(self.radius, super().max_radius)
 
 
-def _tally_of_tape(tape: Tape) -> Tally:
-    """The summary of the operations of a tape."""
-    tally = Tally()
-    numbers: list[Any] = [OperationCounter(tally) for _ in range(COORDINATE_COUNT)]
-    rows: Any = zip(
-        tape.kinds.tolist(), tape.operands.tolist(), tape.constants.tolist(), strict=True
-    )
-    operation: Operation
-    for kind, operands, constants in rows:
-        if kind < 0:
-            continue
-        operation = tape.operations[int(kind)]
-        counters = [numbers[k] for k in operands[: operation.operand_count]]
-        values = [numbers[0].constant(c) for c in constants[: operation.constant_count]]
-        numbers.append(operation.apply(counters, values))
-    return tally
-
-
-def _is_abrupt(field: Any, tally: Tally) -> bool:
-    """Whether a formula may change by far more than its slopes allow within the rounding of
-    coordinates (`FormulaEvaluator.is_abrupt`). The parts of a combination are judged each for
-    itself.
-
-    tally: the summary of the whole formula's operations.
-    """
-    if getattr(field, "lipschitz", None) is not None:
-        return tally.turns_within(1.0)
+def _tallies_of(field: Any) -> Iterator[tuple[Tally, float]]:
+    """For each part of a field the summary of its operations, and the number within which it counts
+    as abrupt if it may turn (`FormulaEvaluator.is_abrupt`). Combinations turn no faster than their
+    parts, of which each is judged by itself, as their own evaluators would judge it."""
+    tally: Tally | None = getattr(field, "tally", None)
     parts = getattr(field, "parts", None)
-    if parts and not hasattr(field, "tally"):
-        return any(_is_abrupt(part, getattr(part, "tally", tally)) for part in parts)
-    return tally.turns_within(tally.finest)
+    inner = getattr(field, "field", None)
+    if tally is None and parts:
+        for part in parts:
+            yield from _tallies_of(part)
+    elif tally is None and isinstance(inner, Field):
+        yield from _tallies_of(inner)
+    else:
+        tally = tally_of(field.formula) if tally is None else tally
+        yield tally, 1.0 if getattr(field, "lipschitz", None) is not None else tally.finest

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from harnack.tape.operations import Operation
     from harnack.tape.pruning import BoxTapes
 
-__all__ = ["TapeFormula", "TapeProgram"]
+__all__ = ["TapeFormula", "TapeProgram", "rounded_ends"]
 
 # An instruction is four words: its operation, and the slot of its result; the slots of its operands
 # in local memory; the row of its constants; flags. A slot has 16 bits.
@@ -68,7 +68,9 @@ class TapeProgram:
             ValueError: a list keeps more than 65,536 results at a time.
         """
         words, before, count = _encode(lists)
-        rows = _ends_of_constants(backend, np.unique(lists.tape.constants, axis=0))
+        ends = rounded_ends(backend, np.unique(lists.tape.constants, axis=0))
+        is_exact = backend.precision == "double"
+        rows = ends[0] if is_exact else np.concatenate(ends, axis=1)
         return cls(
             backend,
             lists.tape.operations,
@@ -163,16 +165,16 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     return both[is_present.ravel()], before, slot_count
 
 
-def _ends_of_constants(backend: Backend, rows: FloatArray) -> FloatArray:
-    """The lower ends of constants (n, 4) and, in single precision, their upper ends, together (n,
-    8): numbers of that precision with the constant between them."""
+def rounded_ends(backend: Backend, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The largest numbers of a backend's precision that are at most the numbers of an array, and
+    the smallest that are at least these."""
     if backend.precision == "double":
-        return rows
+        return numbers, numbers
     with np.errstate(over="ignore"):
-        nearest = rows.astype(np.float32)
-        low = np.where(nearest > rows, np.nextafter(nearest, np.float32(-np.inf)), nearest)
-        high = np.where(nearest < rows, np.nextafter(nearest, np.float32(np.inf)), nearest)
-    return np.concatenate([low, high], axis=1).astype(np.float64)
+        nearest = numbers.astype(np.float32)
+        low = np.where(nearest > numbers, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+        high = np.where(nearest < numbers, np.nextafter(nearest, np.float32(np.inf)), nearest)
+    return low.astype(np.float64), high.astype(np.float64)
 
 
 @dataclass(frozen=True)
