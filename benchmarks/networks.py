@@ -119,11 +119,11 @@ def first_pictures(layers: Layers) -> tuple[float, float]:
         command += [str(number) for number in PICTURE]
         times: list[float] = []
         for _ in range(2):  # the home folder, in which Dr.Jit keeps its kernels, is new
-            done = subprocess.run(
+            process = subprocess.run(
                 command, env=os.environ | {"HOME": folder}, check=True, capture_output=True,
                 text=True,
             )  # fmt: skip
-            times.append(float(done.stdout.split()[-1]))
+            times.append(float(process.stdout.split()[-1]))
     return times[0], times[1]
 
 

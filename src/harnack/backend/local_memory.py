@@ -10,7 +10,9 @@ import drjit as dr
 if TYPE_CHECKING:
     from harnack.backend.arrays import Backend
 
-__all__ = ["allocate_local"]
+__all__ = ["allocate_local", "local_size"]
+
+_MIN_SIZE = 16
 
 
 def allocate_local(backend: Backend, size: int) -> Any:
@@ -23,3 +25,9 @@ def allocate_local(backend: Backend, size: int) -> Any:
     array = dr.alloc_local(backend.Float, size)
     array[backend.UInt32(size - 1)] = backend.Float(0)
     return array
+
+
+def local_size(count: int) -> int:
+    """The size of local arrays for `count` numbers: a power of two, so that kernels do not depend
+    on the exact number."""
+    return max(_MIN_SIZE, 1 << (count - 1).bit_length())

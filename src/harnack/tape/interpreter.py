@@ -17,7 +17,7 @@ import numpy as np
 from harnack.arithmetic import Interval, Jet, Values
 from harnack.arithmetic.jet import Dual
 from harnack.backend.arrays import upload_integers
-from harnack.backend.local_memory import allocate_local
+from harnack.backend.local_memory import allocate_local, local_size
 from harnack.backend.record_table import RecordTable
 from harnack.tape.operations import COORDINATE_COUNT, MAX_CONSTANTS
 
@@ -35,9 +35,6 @@ _MAX_SLOTS = 1 << _SLOT_BITS
 # Flags: whether an operand is read from local memory; whether it is the first or the second operand
 # (otherwise that is the result of the instruction before); and whether the result is written there.
 _READS, _FIRST, _SECOND, _WRITES = 1, 2, 4, 8
-# Local memory has room for at least this number of slots, and then for a power of two, so that
-# kernels do not depend on the exact number.
-_MIN_SLOTS = 16
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class TapeProgram:
             RecordTable.upload(backend, rows),
             upload_integers(backend, before[lists.starts[:-1]]),
             upload_integers(backend, before[lists.starts[1:]]),
-            max(_MIN_SLOTS, 1 << (count - 1).bit_length()),
+            local_size(count),
         )
 
     def formula(self, index: Any, active: Any = True) -> TapeFormula:

@@ -56,7 +56,7 @@ import drjit as dr
 
 from harnack.backend.elementary import fmax, fmin
 from harnack.backend.local_memory import allocate_local
-from harnack.fields.networks.layer_tables import INPUTS, LayerTables, loop, masked
+from harnack.fields.networks.layer_tables import INPUTS, LayerTables, loop
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -126,9 +126,7 @@ def expand(
     lengths: of the ray; or radii of balls.
     direction: of the ray; None for balls.
     """
-    forward = _Forward.start(tables, p, lengths, direction)
-    done = forward.run()
-    return done.backward(p)
+    return _Forward.start(tables, p, lengths, direction).run().backward(p)
 
 
 @dataclass(frozen=True)
@@ -489,7 +487,7 @@ class _Neuron:
     @property
     def local_error(self) -> Real:
         """The part of the error of a(z) that does not come from that of x by the linear network."""
-        kink = masked(self.is_hidden, dr.abs(self.kink))
+        kink = dr.select(self.is_hidden, dr.abs(self.kink), 0)
         first = dr.abs(self.point.slope) * self.own_error + self.point.value_error
         second = (kink + self.point.slope_error + 0.5 * self.second * self.error) * self.error
         return first + second
@@ -497,7 +495,7 @@ class _Neuron:
     @property
     def slope_change(self) -> Real:
         """A bound of the difference between m and the slope of a at the exact z."""
-        return self.wrong_slope + masked(self.is_hidden, dr.abs(self.kink))
+        return self.wrong_slope + dr.select(self.is_hidden, dr.abs(self.kink), 0)
 
     def kept(self) -> list[Real]:
         """What the pass backwards needs: m; the errors of value, of the gradient, and of the slope
@@ -583,7 +581,9 @@ class _Move:
         below = dr.fma(fmax(-slowest, 0), longest, neuron.error)
         low, high = _second_range(tables, layer, z, below, above)
         most = speed * speed
-        least = masked((fastest < 0) | (slowest > 0), fmin(dr.square(fastest), dr.square(slowest)))
+        least = dr.select(
+            (fastest < 0) | (slowest > 0), fmin(dr.square(fastest), dr.square(slowest)), 0
+        )
         second_low = fmin(low * least, low * most)
         second_high = fmax(high * least, high * most)
         wrong = neuron.wrong_slope * speed
@@ -592,18 +592,18 @@ class _Move:
         over = dr.fma(toward, longest, -margin) + 8 * tables.unit * dr.abs(z)
         is_crossing = (over > 0) & ~neuron.is_hidden & (size > 0)
         is_short = toward * longest <= 2 * margin
-        slope = masked(is_crossing & ~is_short, size * over / length)
-        second = masked(is_crossing & is_short, 2 * size * over / (length * length))
-        hidden = masked(neuron.is_hidden, size * speed)
+        slope = dr.select(is_crossing & ~is_short, size * over / length, 0)
+        second = dr.select(is_crossing & is_short, 2 * size * over / (length * length), 0)
+        hidden = dr.select(neuron.is_hidden, size * speed, 0)
         up = neuron.kink > 0
         change = dr.fma(_largest((low, high)), speed * longest, neuron.wrong_slope)
-        change = change + masked(is_crossing | neuron.is_hidden, size)
+        change = change + dr.select(is_crossing | neuron.is_hidden, size, 0)
         return cls(
             speed,
-            -wrong - hidden - masked(~up, slope),
-            wrong + hidden + masked(up, slope),
-            second_low - masked(~up, second),
-            second_high + masked(up, second),
+            -wrong - hidden - dr.select(~up, slope, 0),
+            wrong + hidden + dr.select(up, slope, 0),
+            second_low - dr.select(~up, second, 0),
+            second_high + dr.select(up, second, 0),
             change,
             length,
             change * fastest,

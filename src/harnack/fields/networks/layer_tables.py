@@ -16,6 +16,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.arrays import upload_floats, upload_integers
+from harnack.backend.local_memory import local_size
 from harnack.backend.record_table import PACKET, RecordTable
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ __all__ = [
     "LayerNumbers",
     "LayerTables",
     "loop",
-    "masked",
     "spectral_bound",
 ]
 
@@ -38,8 +38,6 @@ _ROWS, _COLUMNS = 16, 4
 # Sums of squares of fewer numbers than this have a relative error below `NORM_FACTOR` - 1.
 MAX_WIDTH = 4096
 _NORM_FACTOR = 1.001
-# Local memory has room for a power of two of numbers, so that kernels do not depend on it.
-_MIN_WIDTH = 32
 
 
 @dataclass(frozen=True)
@@ -86,11 +84,6 @@ _FLOATS = (
 def _padded(count: int, size: int) -> int:
     """The next multiple of `size`."""
     return -(-count // size) * size
-
-
-def _power_of_two(count: int) -> int:
-    """The next power of two, at least `_MIN_WIDTH`."""
-    return max(_MIN_WIDTH, 1 << (count - 1).bit_length())
 
 
 def _blocks(matrix: FloatArray, rows: int, columns: int) -> FloatArray:
@@ -191,8 +184,8 @@ class LayerTables:
             RecordTable.upload(backend, np.concatenate(records)),
             dr.opaque(backend.Float, float(output_bias[0])),
             dr.opaque(backend.Float, float(np.linalg.norm(output)) * _NORM_FACTOR),
-            _power_of_two(max(_padded(len(weights), _ROWS) for weights, _ in layers[:-1])),
-            _power_of_two(first),
+            local_size(max(_padded(len(weights), _ROWS) for weights, _ in layers[:-1])),
+            local_size(first),
             kinds,
         )
 
@@ -286,8 +279,3 @@ def _of_tuple(function: Callable[[Any], Any]) -> Callable[..., Any]:
         return function(entries)
 
     return of_entries
-
-
-def masked(mask: Mask, value: Real) -> Real:
-    """The value where the mask is true, and 0 elsewhere."""
-    return dr.select(mask, value, 0)

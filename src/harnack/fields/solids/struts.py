@@ -3,12 +3,11 @@ union of capsules or of round cones, one for each edge."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from harnack.backend.validation import (
-    as_positive,
     as_real_array,
     check_coordinate_size,
     check_finite,
@@ -17,7 +16,7 @@ from harnack.backend.validation import (
 )
 from harnack.fields.solids.booleans import smooth_union, union
 from harnack.fields.solids.round_cones import Capsule, RoundCone
-from harnack.fields.solids.tube import checked_pairs
+from harnack.fields.solids.tube import checked_pairs, checked_radii
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -56,7 +55,7 @@ def struts(
     check_finite(points, "node {} of struts", ValueError)
     check_coordinate_size(points, ValueError)
     pairs = checked_pairs(edges, points, ("edge", "node", "struts"))
-    radii = _checked_node_radii(radius, len(points))
+    radii = checked_radii(radius, len(points), ("node", "struts"))
     ends: list[list[int]] = pairs.tolist()
     corners: list[Point] = [(x, y, z) for x, y, z in points.tolist()]
     sizes: list[float] = radii.tolist()
@@ -67,25 +66,3 @@ def struts(
         for a, b in ends
     ]
     return union(parts) if smooth is None else smooth_union(parts, smooth)
-
-
-def _checked_node_radii(radius: Any, count: int) -> FloatArray:
-    """Check the radius, a number or an array (count,), and return the radii (count,) of all nodes.
-
-    Raises:
-        ValueError: a wrong shape, or a radius that is not positive.
-    """
-    array = as_real_array(radius, "the radius of struts")
-    if array.ndim == 0:
-        return np.full(count, as_positive(radius, "the radius of struts"))
-    if array.shape != (count,):
-        raise ValueError(
-            f"the radius of struts is a number, or one for each node, of shape ({count},), not "
-            f"{array.shape}"
-        )
-    radii = np.array(array, dtype=np.float64)
-    is_bad = ~((radii > 0) & np.isfinite(radii))
-    if is_bad.any():
-        k = int(np.flatnonzero(is_bad)[0])
-        as_positive(float(radii[k]), f"the radius of node {k} of struts")
-    return radii

@@ -611,7 +611,7 @@ class TubeNetwork(PatchField):
         self.segments: IntArray = checked_pairs(segments, self.points)
         if len(self.segments) >= MAX_BOXES:
             raise ValueError(f"{len(self.segments):,} segments are too many: at most {MAX_BOXES:,}")
-        self.radius: FloatArray = _checked_radius(radius, len(self.segments))
+        self.radius: FloatArray = checked_radii(radius, len(self.segments))
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
         """Return two arrays (m, 3): the lower and the upper corners of boxes. There is a box for
@@ -750,20 +750,26 @@ def checked_pairs(
     return indices
 
 
-def _checked_radius(radius: Any, count: int) -> FloatArray:
-    """Check the radius, a number or an array (count,), and return the radii (count,) of all
-    segments.
+def checked_radii(
+    radius: Any, count: int, names: tuple[str, str] = ("segment", "tubes")
+) -> FloatArray:
+    """Check a radius, a number or an array (count,), and return the radii (count,).
+
+    names: what each of them belongs to, and what the whole is called in messages.
 
     Raises:
         ValueError: a wrong shape, or a radius that is not positive.
     """
-    array = as_real_array(radius, "the radius of tubes")
+    entry, whole = names
+    array = as_real_array(radius, f"the radius of {whole}")
     if array.ndim == 0:
-        return np.full(count, as_positive(radius, "the radius of tubes"))
+        return np.full(count, as_positive(radius, f"the radius of {whole}"))
     if array.shape != (count,):
         raise ValueError(
-            f"the radius of tubes is a number or has shape ({count},), not {array.shape}"
+            f"the radius of {whole} is a number, or one for each {entry}, of shape ({count},), not "
+            f"{array.shape}"
         )
-    for extreme in (array.min(), array.max()):
-        as_positive(float(extreme), "the radius of tubes")
-    return np.array(array, dtype=np.float64)
+    radii = np.array(array, dtype=np.float64)
+    for k in np.flatnonzero(~((radii > 0) & np.isfinite(radii)))[:1].tolist():
+        as_positive(float(radii[k]), f"the radius of {entry} {k} of {whole}")
+    return radii
