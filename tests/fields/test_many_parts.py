@@ -246,7 +246,7 @@ def test_struts_are_the_hulls_of_their_balls() -> None:
         ({"radius": 0.0}, "the radius of struts must be positive"),
         ({"radius": [0.1, 0.1, -0.1, 0.1]}, "the radius of node 2 of struts must be positive"),
         ({"radius": [0.1, 0.1, math.nan, 0.1]}, "the radius of node 2"),
-        ({"radius": [0.1, 0.1]}, "one for each node, of shape \\(4,\\)"),
+        ({"radius": [0.1, 0.1]}, "a number or has shape \\(4,\\), one for each node, not \\(2,\\)"),
         ({"smooth": -1.0}, "radius must be a number above 0"),
     ],
 )

@@ -766,7 +766,7 @@ def checked_radii(
         return np.full(count, as_positive(radius, f"the radius of {whole}"))
     if array.shape != (count,):
         raise ValueError(
-            f"the radius of {whole} is a number, or one for each {entry}, of shape ({count},), not "
+            f"the radius of {whole} is a number or has shape ({count},), one for each {entry}, not "
             f"{array.shape}"
         )
     radii = np.array(array, dtype=np.float64)
