@@ -28,6 +28,7 @@ ROOMS = (
     "cluster",
     "tree",
     "arithmetic",
+    "tape",
     "enclosures",
     "fmm",
     "fields",
@@ -68,7 +69,7 @@ CAPABILITIES = ("capabilities",)
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("solid_angles") :]
 # Modules at the top that only gather names of any rooms, for users; no room imports from them.
-NAMESPACES = ("io", "kernels", "math", "printing", "proofs", "solids")
+NAMESPACES = ("io", "kernels", "lattice", "math", "printing", "proofs", "solids")
 # At the top: may import from any room.
 FREE = ("__init__", "__main__", "testing", *NAMESPACES)
 

@@ -180,6 +180,10 @@ class FormulaEvaluator(Evaluator):
         # The vector that is added makes sure that the direction runs along no tie.
         direction = dr.select(norm > 0, middle / norm, 0) + type(p)(*_TIE_DIRECTION)
         size = max_norm(p) + dr.abs(sample.value)
+        # Numbers in the formula may be larger than p: over the length in which f changes by the
+        # error of its value, they change by about their rounding.
+        length = sample.value_error / (norm + error)
+        size = size + dr.select(dr.isfinite(length), length / epsilon, 0)
         # At the origin with f = 0 any offset will do.
         size = dr.select(size > 0, size, 1)
         # Value and gradient at a point a few roundings away.

@@ -104,9 +104,7 @@ class Network(Field):
         self.domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if domain is None else domain
         lower, upper = self.domain.bounds()
         if not np.isfinite([lower, upper]).all():
-            raise ValueError(
-                f"the domain of a network must be bounded, such as hk.Box(...), not {domain!r}"
-            )
+            raise ValueError(f"the domain of a network must be a bounded volume, not {domain!r}")
         self.default_level = self.level = float(level)
         if not np.isfinite(self.level):
             raise ValueError(f"level must be a finite number, not {level!r}")
