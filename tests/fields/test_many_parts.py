@@ -13,6 +13,7 @@ import pytest
 import harnack as hk
 from harnack.fields.solids import booleans
 from harnack.fields.solids.booleans import BlendedSolid, BooleanSolid
+from harnack.fields.solids.struts import Struts
 
 POINTS = np.random.default_rng(0).uniform(-1.5, 1.5, (300, 3))
 NODES = np.array([[0.0, 0, 0], [1, 0.2, 0], [0.1, 1, 0.3], [0, 0.2, 1]])
@@ -222,12 +223,11 @@ def test_struts_are_the_hulls_of_their_balls() -> None:
         distance = np.linalg.norm(x[:, None] - axis, axis=-1) - r
         expected = np.minimum(expected, distance.min(axis=1))
     np.testing.assert_allclose(solid.value(x, precision="double"), expected, rtol=0, atol=1e-7)
-    assert isinstance(solid, BooleanSolid)
-    kinds = [type(part).__name__ for part in solid.parts]
-    assert kinds == ["RoundCone", "RoundCone", "RoundCone", "RoundCone"]
+    assert isinstance(solid, Struts)
+    assert {type(solid.strut(k)) for k in range(len(EDGES))} == {hk.solids.RoundCone}
     same = hk.solids.struts(NODES, EDGES, 0.1)
-    assert {type(part) for part in same.parts} == {hk.Capsule}  # type: ignore[attr-defined]
-    assert same.parts[2].start == tuple(NODES[3])  # type: ignore[attr-defined]
+    assert isinstance(same, Struts)
+    assert same.strut(2) == hk.Capsule(tuple(NODES[3]), tuple(NODES[EDGES[2][1]]), 0.1)
     smooth = hk.solids.struts(NODES, EDGES, 0.1, smooth=0.2)
     assert isinstance(smooth, BlendedSolid)
     assert (smooth.radius, smooth.power) == (0.2, 2.0)

@@ -33,6 +33,7 @@ from harnack.arithmetic.norms import (
     norm,
     orthogonal_intersection,
 )
+from harnack.arithmetic.segments import cone_distance, segment_distance
 from harnack.arithmetic.values import Values
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "atan2",
     "blend_intersection",
     "blend_union",
+    "cone_distance",
     "cos",
     "cosh",
     "exp",
@@ -59,6 +61,7 @@ __all__ = [
     "orthogonal_intersection",
     "power",
     "reciprocal",
+    "segment_distance",
     "sin",
     "sinh",
     "sqrt",

@@ -45,7 +45,7 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     """
     if len(values) < 2:
         raise TypeError(f"{name} compares two numbers or more, and {len(values)} was given")
-    whole = _as_one_operation(name, values)
+    whole = as_one_operation(name, values)
     if whole is not None:
         return whole
     if any(isinstance(value, FormulaNumber) for value in values):
@@ -62,7 +62,7 @@ def _reduce_extremum(name: str, values: tuple[Any, ...]) -> Any:
     return functools.reduce(plain, values)
 
 
-def _as_one_operation(name: str, values: tuple[Any, ...], *literals: float) -> Any:
+def as_one_operation(name: str, values: tuple[Any, ...], *literals: float) -> Any:
     """A function of several numbers as a single operation of their arithmetic
     (`FormulaNumber.of_several`); None if they have none."""
     number = next((value for value in values if isinstance(value, FormulaNumber)), None)
@@ -105,7 +105,7 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         return sizes[0] if len(sizes) == 1 else maximum(*sizes)
     if p == 1.0:
         return functools.reduce(lambda a, b: a + b, [absolute(term) for term in values])
-    whole = _as_one_operation("norm", values, p)
+    whole = as_one_operation("norm", values, p)
     if whole is not None:
         return whole
     jets = [term for term in values if isinstance(term, Jet)]
@@ -334,7 +334,7 @@ def blend_union(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     radii, as in Hart's paper, the function is not continuous at g = 0, and there is no constant at
     all.
     """
-    whole = _as_one_operation("blended union", (a, b, radius), power)
+    whole = as_one_operation("blended union", (a, b, radius), power)
     if whole is not None:
         return whole
     jets = [operand for operand in (a, b) if isinstance(operand, Jet)]
@@ -455,7 +455,7 @@ def blend_intersection(a: Any, b: Any, radius: Any, power: float = 2.0) -> Any:
     radius: the blend changes the intersection where both -a and -b are less than this.
     power: at least 1; larger powers make the edge sharper (`blend_union`).
     """
-    whole = _as_one_operation("blended intersection", (a, b, radius), power)
+    whole = as_one_operation("blended intersection", (a, b, radius), power)
     return -blend_union(-a, -b, radius, power) if whole is None else whole
 
 
@@ -470,7 +470,7 @@ def orthogonal_intersection(*sides: Any) -> Any:
     is positive, it is that one, the largest. Inside, the largest of the functions is minus the
     distance to the nearest boundary.
     """
-    whole = _as_one_operation("orthogonal intersection", sides)
+    whole = as_one_operation("orthogonal intersection", sides)
     if whole is not None:
         return whole
     largest = maximum(*sides)

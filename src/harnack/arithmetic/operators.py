@@ -105,10 +105,10 @@ class FormulaNumber(abc.ABC):
         """A function of several numbers, as a single operation of this arithmetic; None, the
         default, if it is to be computed from operations of one and two numbers.
 
-        name: "maximum", "minimum", "norm", "orthogonal intersection", "blended union" or "blended
-            intersection".
+        name: "maximum", "minimum", "norm", "orthogonal intersection", "blended union", "blended
+            intersection", "segment distance" or "cone distance".
         values: the numbers, of any kind, at least one of them of this arithmetic.
-        literals: the p of a norm, the power of a blend.
+        literals: the p of a norm, the power of a blend, the numbers of a segment or a cone.
         """
         del name, values, literals
         return None

@@ -85,18 +85,22 @@ class _UploadedTape:
     cells: TapeCells | None
 
 
-def tape_evaluator(field: Any, backend: Backend, plan: Plan) -> TapeEvaluator | None:
+def tape_evaluator(
+    field: Any, backend: Backend, plan: Plan, *, shortest: int | None = None
+) -> TapeEvaluator | None:
     """The evaluator of a field by its tape; None if its formula is short, or cannot be recorded.
 
     field: a field with a method `formula`.
+    shortest: the largest number of instructions of a short formula; None for the number from which
+        on interpreting was measured to be quicker.
 
     Raises:
         NotImplementedError: a formula that must be compiled (`compiled_formulas`) is too long.
     """
     tape = recorded_tape(field)
-    shortest = (
-        _MIN_INSTRUCTIONS if hasattr(cast("Any", type(field)), "tally") else _MIN_INSTRUCTIONS // 2
-    )
+    if shortest is None:
+        is_single = hasattr(cast("Any", type(field)), "tally")
+        shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
     if tape is None or len(tape) <= shortest:
         return None
     if _ONLY_COMPILED.get():

@@ -22,20 +22,20 @@ __all__ = ["CELL_MARGIN", "TapeCells"]
 CELL_MARGIN = 1 / 8
 """How far beyond a cell its tape is valid, as a fraction of the cell's size."""
 
-# Cells are not divided if their list has at most this many entries.
-_SHORT_LIST = 4
 # Cells are not smaller than this fraction of the largest coordinate, so that rounding in single
 # precision moves points by far less than the margin.
 _MIN_CELL = 2.0**-13
 # The grid is larger than the box by about this fraction, half on each side.
 _BORDER = 1 / 16
 # The smallest and the largest number of times that the box is divided.
-_MIN_DEPTH, _MAX_DEPTH = 3, 6
+_MIN_DEPTH, _MAX_DEPTH = 3, 7
 # Where all values matter, lists are longer, and the box is divided this number of times less.
 _COARSER = 2
-# Cells are divided no further if the lists of all of their octants would have more entries; and the
-# number of entries that are treated at once, so that they stay in the processor's cache.
-_MAX_ENTRIES, _ENTRIES_AT_ONCE = 24_000_000, 400_000
+# Cells are divided no further if all of their octants would be more, or the lists of these would
+# have more entries.
+_MAX_OCTANTS, _MAX_ENTRIES = 1_000_000, 24_000_000
+# The number of entries that are treated at once, so that they stay in the processor's cache.
+_ENTRIES_AT_ONCE = 400_000
 _OCTANTS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
@@ -70,7 +70,7 @@ class TapeCells(GridData):
         Proof that a cell is empty: the range of the formula on the enlarged cell does not contain a
         level.
         """
-        depth = round(2.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
+        depth = round(3.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
         depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
         reach = float(np.abs([lower, upper]).max())
         longest = float((upper - lower).max()) * (1 + _BORDER)
@@ -142,17 +142,16 @@ class _Octree:
         """
         batches = _batches(lists.lengths)
         results = [self._pruned(lists, indices, limits, rest, cells) for cells in batches]
-        is_divided = [
-            ~self._is_empty(part) & (part.lists.lengths > _SHORT_LIST) & (rest > 0)
-            for part in results
-        ]
+        is_divided = [~self._is_empty(part) & (rest > 0) for part in results]
+        octant_count = 8 * sum(int(divided.sum()) for divided in is_divided)
         entry_count = sum(
             8 * int(part.lists.lengths[divided].sum())
             for part, divided in zip(results, is_divided, strict=True)
         )
+        is_last = octant_count > _MAX_OCTANTS or entry_count > _MAX_ENTRIES
         octants: list[tuple[BoxTapes, IntArray, BoxLimits]] = []
         for part, divided, cells in zip(results, is_divided, batches, strict=True):
-            divided &= entry_count <= _MAX_ENTRIES
+            divided &= not is_last
             leaves, inner = np.flatnonzero(~divided), np.flatnonzero(divided)
             self.parts.append(_subset(part, leaves))
             self.leaves.append((indices[cells][leaves], rest, self._is_empty(self.parts[-1])))

@@ -19,12 +19,13 @@ from harnack.arithmetic.jet import Dual
 from harnack.backend.arrays import upload_integers
 from harnack.backend.local_memory import allocate_local, local_size
 from harnack.backend.record_table import RecordTable
-from harnack.tape.operations import COORDINATE_COUNT, MAX_CONSTANTS
+from harnack.tape.operations import COORDINATE_COUNT
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, BoolArray, FloatArray, Index, IntArray, Real
     from harnack.tape.operations import Operation
     from harnack.tape.pruning import BoxTapes
+    from harnack.tape.recording import Tape
 
 __all__ = ["TapeFormula", "TapeProgram", "rounded_ends"]
 
@@ -46,6 +47,7 @@ class TapeProgram:
     words: the instructions of all lists, `_WORDS` integers for each.
     constants: rows of lower ends of constants and, in single precision, of their upper ends.
     begins, ends: for each list the first instruction, and that after the last one.
+    constant_count: the length of rows of lower ends.
     slot_count: the number of slots in local memory.
     """
 
@@ -55,6 +57,7 @@ class TapeProgram:
     constants: RecordTable
     begins: Index
     ends: Index
+    constant_count: int
     slot_count: int
 
     @classmethod
@@ -65,7 +68,7 @@ class TapeProgram:
             ValueError: a list keeps more than 65,536 results at a time.
         """
         words, before, count = _encode(lists)
-        ends = rounded_ends(backend, np.unique(lists.tape.constants, axis=0))
+        ends = rounded_ends(backend, lists.tape.constants[_rows_of_constants(lists.tape)])
         is_exact = backend.precision == "double"
         rows = ends[0] if is_exact else np.concatenate(ends, axis=1)
         return cls(
@@ -75,6 +78,7 @@ class TapeProgram:
             RecordTable.upload(backend, rows),
             upload_integers(backend, before[lists.starts[:-1]]),
             upload_integers(backend, before[lists.starts[1:]]),
+            ends[0].shape[1],
             local_size(count),
         )
 
@@ -134,7 +138,7 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     is_written[operand[reads]] = True
     is_written[third[arity == 3]] = True
     is_written[loaded[loads]] = True
-    row_of = np.unique(tape.constants, axis=0, return_inverse=True)[1].reshape(-1)
+    row_of = np.cumsum(_rows_of_constants(tape)) - 1
     flags: Any = (
         _READS * reads + _FIRST * reads_first + _SECOND * reads_second + _WRITES * is_written
     )
@@ -160,6 +164,15 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     is_present: Any = np.stack([loads | is_plain_load, is_run], axis=1)
     before = np.concatenate([[0], np.cumsum(is_present.sum(axis=1))])
     return both[is_present.ravel()], before, slot_count
+
+
+def _rows_of_constants(tape: Tape) -> BoolArray:
+    """For each instruction (n,) whether its constants are a row of the table of constants. The
+    others have no constants, but the first is a row, so that there is one."""
+    counts = np.array([operation.constant_count for operation in tape.operations] + [0])
+    has_row = counts[tape.kinds] > 0  # kinds: -1 for coordinates
+    has_row[0] = True
+    return has_row
 
 
 def rounded_ends(backend: Backend, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -284,7 +297,8 @@ class TapeFormula:
         low = constants[: operation.constant_count]
         if is_double:
             return [like.constant(number) for number in low]
-        high = constants[MAX_CONSTANTS : MAX_CONSTANTS + operation.constant_count]
+        width = self.program.constant_count
+        high = constants[width : width + operation.constant_count]
         return [like.constant_between(*ends) for ends in zip(low, high, strict=True)]
 
 

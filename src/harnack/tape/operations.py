@@ -11,6 +11,7 @@ arrays. A bound that is not known is infinite.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,17 +23,18 @@ from harnack.arithmetic import (
     atan2,
     blend_intersection,
     blend_union,
+    cone_distance,
     maximum,
     minimum,
     norm,
     orthogonal_intersection,
+    segment_distance,
 )
 from harnack.arithmetic.functions import ElementaryFunction, reciprocal
 from harnack.backend import FloatArray, IntArray
 
 __all__ = [
     "COORDINATE_COUNT",
-    "MAX_CONSTANTS",
     "Operation",
     "blend_operation",
     "function_operation",
@@ -51,8 +53,6 @@ LimitFunction: TypeAlias = "Callable[[Sequence[FloatArray], Range], Range]"
 
 # The first instructions of every tape are the coordinates x, y and z.
 COORDINATE_COUNT = 3
-# The largest number of constants of an operation.
-MAX_CONSTANTS = 4
 # Ends of ranges are moved outwards by this many units in the last place: NumPy's elementary
 # functions are wrong by at most four.
 _UNITS = 16.0
@@ -69,7 +69,7 @@ class Operation:
     other number below the floor, without a change of the whole formula.
 
     name: what identifies it; it contains literal numbers that kernels depend on, such as exponents.
-    operand_count, constant_count: the numbers of operands and of constants, at most 3 and 4.
+    operand_count, constant_count: the numbers of operands and of constants, at most 3 and 16.
     apply: computes the result from the operands, numbers of one arithmetic, and the constants,
         which are numbers of that arithmetic too.
     ranges: computes the range of the result from those of the operands, without rounding outwards.
@@ -393,11 +393,88 @@ def _distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
 def _distance_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
     moved = [_sum_of([a, (-c, -c)]) for a, c in zip(operands, constants, strict=False)]
     low, high = _norm_ranges(2.0)(moved, ())
-    if len(constants) == 3:
+    return _minus_radius((low, high), constants[3:])
+
+
+def _segment_distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
+    """`segment_distance`, and minus a radius, if there is one."""
+    distance = segment_distance(operands, constants[:12], constants[12])
+    return distance - constants[13] if len(constants) > 13 else distance
+
+
+def _cone_distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
+    """`cone_distance`, and minus a radius, if there is one."""
+    distance = cone_distance(operands, constants[:12], *constants[12:15])
+    return distance - constants[15] if len(constants) > 15 else distance
+
+
+def _segment_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
+    """The ranges of `segment_distance` on boxes, with or without a radius.
+
+    Proof. Let c be the center of a box, and e = (+-e_x, +-e_y, e_z) its half diagonals. Along the
+    axis a the box reaches from its center as far as the largest |a . e|. Across it, it reaches as
+    far as the largest sqrt(|e|^2 - (a . e)^2): the distance across is convex, and so largest at a
+    corner.
+    """
+    half_length, radius = constants[12], constants[13:]
+    center, half, slack = _boxes(operands, constants)
+    axis = constants[:3]
+    diagonals = [
+        half[0] * axis[0] * s + half[1] * axis[1] * t + half[2] * axis[2]
+        for s, t in itertools.product((1.0, -1.0), repeat=2)
+    ]
+    along, *across = (
+        center[0] * constants[k] + center[1] * constants[k + 1] + center[2] * constants[k + 2]
+        - constants[k + 3]
+        for k in (0, 4, 8)
+    )  # fmt: skip
+    from_axis = _norm_on_numpy(across, 2.0)
+    sizes = [np.abs(entry) for entry in diagonals]
+    reach_along = functools.reduce(np.maximum, sizes) + slack
+    least = functools.reduce(np.minimum, sizes)
+    squares = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
+    reach_across = np.sqrt(np.maximum(squares - least * least, 0.0)) + slack
+    nearest, farthest = np.abs(along) - reach_along, np.abs(along) + reach_along
+    low, high = (
+        _norm_on_numpy([np.maximum(q, 0.0), np.maximum(h - half_length, 0.0)], 2.0)
+        for q, h in ((from_axis - reach_across, nearest), (from_axis + reach_across, farthest))
+    )
+    return _minus_radius((low - slack, high + slack), radius)
+
+
+def _cone_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
+    """The ranges of `cone_distance` on boxes, with or without a radius: its Lipschitz constant is
+    1, and half of the diagonal is the largest distance from the center."""
+    center, half, slack = _boxes(operands, constants)
+    value = cone_distance(center, constants[:12], *constants[12:15])
+    reach = _norm_on_numpy(half, 2.0) + slack + np.abs(constants[12]) * _ROUNDING_OF_POINTS
+    return _minus_radius((value - reach, value + reach), constants[15:])
+
+
+# The rounding of distances from segments, relative to the size of coordinates.
+_ROUNDING_OF_POINTS = 64 * float(np.finfo(np.float64).eps)
+
+
+def _boxes(
+    operands: Sequence[Range], constants: Sequence[FloatArray]
+) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+    """The centers of boxes, half of their sides, and a bound of the rounding of lengths in the
+    frame that the constants begin with: of its unit vectors, and of sums of products."""
+    center = [0.5 * low + 0.5 * high for low, high in operands]
+    half = [0.5 * high - 0.5 * low for low, high in operands]
+    lengths = [*center, *half, *(constants[k] for k in (3, 7, 11))]
+    size: Any = sum(np.abs(entry) for entry in lengths)
+    # A difference of squares of half sides is rounded by a fraction of them, and its root by more.
+    return center, half, _ROUNDING_OF_POINTS * size + 1e-7 * sum(half)
+
+
+def _minus_radius(distance: Range, radius: Sequence[FloatArray]) -> Range:
+    """The range minus a radius, if there is one. The distance is rounded, too."""
+    low, high = distance
+    if not len(radius):
         return low, high
-    # The distance is rounded, too.
-    slack = _UNITS * float(np.finfo(np.float64).eps) * high
-    return low - slack - constants[3], high + slack - constants[3]
+    slack = _UNITS * float(np.finfo(np.float64).eps) * np.abs(high)
+    return low - slack - radius[0], high + slack - radius[0]
 
 
 _OPERATIONS = (
@@ -444,6 +521,13 @@ _OPERATIONS = (
     Operation("distance", 3, 3, _distance, _distance_ranges),
     Operation("distance of point", 3, 3, _distance, _distance_ranges, is_of_point=True),
     Operation("ball", 3, 4, _distance, _distance_ranges, is_of_point=True),
+    Operation("segment distance", 3, 13, _segment_distance, _segment_ranges),
+    Operation("segment distance of point", 3, 13, _segment_distance, _segment_ranges,
+              is_of_point=True),
+    Operation("capsule", 3, 14, _segment_distance, _segment_ranges, is_of_point=True),
+    Operation("cone distance", 3, 15, _cone_distance, _cone_ranges),
+    Operation("cone distance of point", 3, 15, _cone_distance, _cone_ranges, is_of_point=True),
+    Operation("round cone", 3, 16, _cone_distance, _cone_ranges, is_of_point=True),
     *(
         Operation(
             f"orthogonal {n}", n, 0, lambda a, k: orthogonal_intersection(*a),

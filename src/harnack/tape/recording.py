@@ -18,7 +18,6 @@ from harnack.arithmetic.operators import FormulaNumber, exponent_of
 from harnack.backend import FloatArray, IntArray
 from harnack.tape.operations import (
     COORDINATE_COUNT,
-    MAX_CONSTANTS,
     Operation,
     blend_operation,
     function_operation,
@@ -32,6 +31,12 @@ if TYPE_CHECKING:
 __all__ = ["Tape", "TapeNumber", "record"]
 
 _MAX_OPERANDS = 3
+# The operations that are distances minus a radius.
+_MINUS_RADIUS = {
+    "distance of point": "ball",
+    "segment distance of point": "capsule",
+    "cone distance of point": "round cone",
+}
 # A number that is recorded is a sum of at most this many multiples of results of instructions.
 _MAX_TERMS = 3
 
@@ -43,7 +48,7 @@ class Tape:
     operations: the operations that occur, each once.
     kinds: (n,) for each instruction the index of its operation; -1 for coordinates.
     operands: (n, 3) the instructions that are its operands, all before it; -1 for none.
-    constants: (n, 4) its constants, 0 where there are fewer.
+    constants: (n, c) its constants, 0 where there are fewer.
     result: the instruction whose result is the value of the formula.
     """
 
@@ -58,7 +63,7 @@ class Tape:
 
     @functools.cached_property
     def constant_columns(self) -> FloatArray:
-        """The constants as an array (4, n)."""
+        """The constants as an array (c, n)."""
         return np.ascontiguousarray(self.constants.T)
 
     @functools.cached_property
@@ -124,7 +129,8 @@ class _Recorder:
                 new_index[k] = len(rows)
                 rows.append(self.rows[k])
         operands = np.full((len(rows), _MAX_OPERANDS), -1, np.int64)
-        constants = np.zeros((len(rows), MAX_CONSTANTS))
+        width = max((len(row[2]) for row in rows), default=0)
+        constants = np.zeros((len(rows), max(width, 1)))
         for k, (_, row_operands, row_constants) in enumerate(rows):
             operands[k, : len(row_operands)] = [new_index[j] for j in row_operands]
             constants[k, : len(row_constants)] = row_constants
@@ -187,8 +193,9 @@ class TapeNumber(FormulaNumber):
             return add(operation_named("constant"), (), (shift,))
         if factors == (1.0,):
             kind, operands, constants = self.recorder.rows[indices[0]]
-            if kind >= 0 and self.recorder.operations[kind].name == "distance of point":
-                return add(operation_named("ball"), operands, (*constants, -shift))
+            name = _MINUS_RADIUS.get(self.recorder.operations[kind].name) if kind >= 0 else None
+            if name is not None:
+                return add(operation_named(name), operands, (*constants, -shift))
             return add(operation_named("shift"), indices, (shift,))
         if shift == 0.0:
             if factors == (-1.0,):
@@ -333,6 +340,11 @@ class TapeNumber(FormulaNumber):
             if not 2 <= count <= _MAX_OPERANDS:
                 return None
             return self._instruction(operation_named(f"orthogonal {count}"), numbers)
+        if name in ("segment distance", "cone distance"):
+            indices = tuple(number.index for number in numbers)
+            of_point = " of point" if indices == tuple(range(COORDINATE_COUNT)) else ""
+            operation = operation_named(name + of_point)
+            return self._of_instruction(self.recorder.add(operation, indices, literals))
         # Blended unions and intersections: two numbers and the radius.
         a, b, radius = numbers
         if radius.terms:

@@ -1,29 +1,26 @@
 """Segments with a thickness: capsules, and round cones, whose radius varies along the segment. Both
 are convex hulls of two balls, and their functions are the exact signed distances. Lattices and
-networks of struts are unions of many (`harnack.fields.solids.struts`). So their formulas have few
-operations: coordinates are taken along and across the axis, in a frame that is computed once."""
+networks of struts are unions of many (`harnack.fields.solids.struts`)."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-from harnack.arithmetic import maximum, minimum, norm
+from harnack.arithmetic import cone_distance, norm, segment_distance
 from harnack.backend.validation import as_positive, as_triple
 from harnack.fields.solids.solid import FormulaSolid, Point, box_around, set_frozen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from harnack.arithmetic.segments import Frame
     from harnack.geometry import Volume
 
-# Rows (a, b, c, d): a local coordinate is a x + b y + c z - d.
-_Frame: TypeAlias = tuple[tuple[float, float, float, float], ...]
 
-
-def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> _Frame:
+def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> Frame:
     """The frame of three local coordinates that are 0 at `origin`: the first is along the axis, the
     other two are at right angles to it and to each other (Duff et al. 2017, "Building an
     orthonormal basis, revisited").
@@ -39,36 +36,28 @@ def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> _Frame:
     o = origin
     # Adding 0.0 makes -0.0 the number 0.0.
     return tuple(
-        (u + 0.0, v + 0.0, w + 0.0, math.fsum((u * o[0], v * o[1], w * o[2])) + 0.0)
+        entry + 0.0
         for u, v, w in rows
+        for entry in (u, v, w, math.fsum((u * o[0], v * o[1], w * o[2])))
     )
-
-
-def _local_coordinates(frame: _Frame, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-    """The local coordinates of a point, the one along the axis first. Coordinates may be numbers of
-    any arithmetic."""
-    along, across, other = (x * a + y * b + z * c - d for a, b, c, d in frame)
-    return along, across, other
 
 
 @dataclass(frozen=True)
 class Capsule(FormulaSolid):
     """The points within `radius` of the segment from `start` to `end`. f is the signed distance.
 
-    Let h be the coordinate along the segment from its middle, u and v two coordinates across it,
-    and L its length. Then f = |(u, v, max(0, |h| - L/2))| - radius. As the distance from a set
-    minus a constant, f has the Lipschitz constant 1.
+    f is the distance from the segment (`segment_distance`) minus the radius.
     """
 
     is_convex = True
 
-    # The unit vectors of the coordinates are rounded.
+    # The unit vectors of the frame are rounded.
     lipschitz = 1.0 + 1e-6
 
     start: Point = (0.0, 0.0, -1.0)
     end: Point = (0.0, 0.0, 1.0)
     radius: float = 0.5
-    _frame: _Frame = dataclasses.field(init=False, repr=False, compare=False)
+    _frame: Frame = dataclasses.field(init=False, repr=False, compare=False)
     _half_length: float = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -92,9 +81,7 @@ class Capsule(FormulaSolid):
         set_frozen(self, "_half_length", half_length)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        along, across, other = _local_coordinates(self._frame, x, y, z)
-        beyond = maximum(abs(along) - self._half_length, 0.0)
-        return norm(across, other, beyond) - self.radius
+        return segment_distance((x, y, z), self._frame, self._half_length) - self.radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box of the segment, grown by radius
@@ -134,13 +121,14 @@ class RoundCone(FormulaSolid):
 
     is_convex = True
 
-    # The unit vectors of the coordinates and the slope are rounded.
+    # The unit vectors of the frame and the slope are rounded.
     lipschitz = 1.0 + 1e-6
 
     start: Point = (0.0, 0.0, -1.0)
     end: Point = (0.0, 0.0, 1.0)
     radii: tuple[float, float] = (0.5, 0.25)
-    _frame: _Frame = dataclasses.field(init=False, repr=False, compare=False)
+    _frame: Frame = dataclasses.field(init=False, repr=False, compare=False)
+    _center: Point = dataclasses.field(init=False, repr=False, compare=False)
     _numbers: tuple[float, ...] = dataclasses.field(init=False, repr=False, compare=False)
     _is_ball: bool = dataclasses.field(init=False, repr=False, compare=False)
 
@@ -170,17 +158,16 @@ class RoundCone(FormulaSolid):
             # s/c, with a product that loses no digits where both lengths are nearly equal.
             ratio = difference / math.sqrt((length - difference) * (length + difference))
         set_frozen(self, "_frame", _axial_frame(centers[0], axis))
+        set_frozen(self, "_center", centers[0])
         set_frozen(self, "_numbers", (large, length, slope, ratio))
         set_frozen(self, "_is_ball", is_ball)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        along, across, other = _local_coordinates(self._frame, x, y, z)
         radius, length, slope, ratio = self._numbers
         if self._is_ball:
-            return norm(along, across, other) - radius
-        from_axis = norm(across, other)
-        t = minimum(maximum(along - from_axis * ratio, 0.0), length)
-        return norm(from_axis, along - t) + t * slope - radius
+            x, y, z = (v - c for v, c in zip((x, y, z), self._center, strict=True))
+            return norm(x, y, z) - radius
+        return cone_distance((x, y, z), self._frame, length, slope, ratio) - radius
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box around both balls, each with

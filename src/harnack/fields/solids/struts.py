@@ -3,10 +3,14 @@ union of capsules or of round cones, one for each edge."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from harnack.arithmetic import minimum
+from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend.validation import (
     as_real_array,
     check_coordinate_size,
@@ -14,15 +18,105 @@ from harnack.backend.validation import (
     check_vectors,
     no_derivatives,
 )
-from harnack.fields.solids.booleans import smooth_union, union
+from harnack.fields.evaluator import POINTS, Plan
+from harnack.fields.solids.booleans import smooth_union
 from harnack.fields.solids.round_cones import Capsule, RoundCone
+from harnack.fields.solids.solid import FormulaSolid, box_around, set_frozen
 from harnack.fields.solids.tube import checked_pairs, checked_radii
+from harnack.fields.tape_evaluator import tape_evaluator
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from harnack.backend import FloatArray
-    from harnack.fields.solids.solid import Point, Solid
+    from harnack.backend import Backend, FloatArray, IntArray
+    from harnack.fields.formula_evaluator import FormulaEvaluator
+    from harnack.fields.solids.solid import Solid
+    from harnack.geometry import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Struts(FormulaSolid):
+    """The union of struts, one for each edge of a graph. A strut is the convex hull of two balls, a
+    capsule or a round cone (`RoundCone`); f is the least of their signed distances. `struts` makes
+    one from any arrays.
+
+    nodes: (n, 3) points.
+    edges: (m, 2) indices of nodes, counted from 0.
+    radii: (n,) of the balls about the nodes.
+    """
+
+    nodes: FloatArray
+    edges: IntArray
+    radii: FloatArray
+
+    lipschitz = Capsule.lipschitz
+
+    def __post_init__(self) -> None:
+        """Check the arrays, and make them read-only."""
+        array = as_real_array(self.nodes, "the nodes of struts")
+        check_vectors(array, "the nodes of struts")
+        nodes: FloatArray = np.array(array, dtype=np.float64)
+        check_finite(nodes, "node {} of struts", ValueError)
+        check_coordinate_size(nodes, ValueError)
+        edges = checked_pairs(self.edges, nodes, ("edge", "node", "struts"))
+        radii = checked_radii(self.radii, len(nodes), ("node", "struts"))
+        for name, entries in (("nodes", nodes), ("edges", edges), ("radii", radii)):
+            entries.setflags(write=False)
+            set_frozen(self, name, entries)
+
+    def __repr__(self) -> str:
+        return f"Struts({len(self.nodes):,} nodes, {len(self.edges):,} edges)"
+
+    def strut(self, number: int) -> Capsule | RoundCone:
+        """The strut of the edge with this number."""
+        a, b = self.edges[number].tolist()
+        start, end = ((x, y, z) for x, y, z in self.nodes[[a, b]].tolist())
+        first, second = float(self.radii[a]), float(self.radii[b])
+        if first == second:
+            return Capsule(start, end, first)
+        return RoundCone(start, end, (first, second))
+
+    @functools.cached_property
+    def _parts(self) -> list[Capsule | RoundCone]:
+        """The struts of all edges."""
+        return [self.strut(k) for k in range(len(self.edges))]
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        values = [strut.formula(x, y, z) for strut in self._parts]
+        return minimum(*values) if len(values) > 1 else values[0]
+
+    @functools.cached_property
+    def tally(self) -> Tally:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The summary of the formula's operations, of those struts whose numbers are the largest:
+        others turn less sharply."""
+        start, end = self.nodes[self.edges.T]
+        first, second = self.radii[self.edges.T]
+        length = np.linalg.norm(end - start, axis=1)
+        farthest = np.abs(start + end).max(axis=1)
+        steepest = np.abs(first - second) / length
+        numbers = {int(entries.argmax()) for entries in (farthest, length, steepest)}
+        struts = [self.strut(k) for k in numbers]
+
+        def least(x: Any, y: Any, z: Any) -> Any:
+            """The least of their functions."""
+            return functools.reduce(minimum, [strut.formula(x, y, z) for strut in struts])
+
+        return tally_of(least)
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> FormulaEvaluator:
+        # Few are interpreted as well, so that another graph compiles nothing.
+        return tape_evaluator(self, backend, plan, shortest=0) or super().evaluator(backend, plan)
+
+    def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
+        """The box around all balls, whose radii grow by the level. None if `above`, as then the
+        points are unbounded."""
+        if above:
+            return None
+        used = np.unique(self.edges)
+        reach = (self.radii[used] + level)[:, None]
+        low, high = (self.nodes[used] - reach).min(axis=0), (self.nodes[used] + reach).max(axis=0)
+        half, center = (0.5 * high - 0.5 * low).tolist(), (0.5 * high + 0.5 * low).tolist()
+        return box_around((half[0], half[1], half[2]), center)
 
 
 @no_derivatives
@@ -41,28 +135,14 @@ def struts(
     radius: a number, the radius of all struts; or (n,), one for each node.
     smooth: the radius of fillets between struts (`smooth_union`); None for none.
 
-    Part k of the union is the strut of edge k. Ends are round, so that the struts at a node join
-    without gaps. In contrast to `TubeNetwork`, the result is a solid, which is combined, cut and
-    moved.
+    Ends are round, so that the struts at a node join without gaps. In contrast to `TubeNetwork`,
+    the result is a solid, which is combined, cut and moved.
 
     Raises:
         ValueError: arrays of other shapes, numbers that are not finite, an index out of range, an
             edge without a length, or a radius that is not positive.
     """
-    array = as_real_array(nodes, "the nodes of struts")
-    check_vectors(array, "the nodes of struts")
-    points: FloatArray = np.array(array, dtype=np.float64)
-    check_finite(points, "node {} of struts", ValueError)
-    check_coordinate_size(points, ValueError)
-    pairs = checked_pairs(edges, points, ("edge", "node", "struts"))
-    radii = checked_radii(radius, len(points), ("node", "struts"))
-    ends: list[list[int]] = pairs.tolist()
-    corners: list[Point] = [(x, y, z) for x, y, z in points.tolist()]
-    sizes: list[float] = radii.tolist()
-    parts: list[Solid] = [
-        Capsule(corners[a], corners[b], sizes[a])
-        if sizes[a] == sizes[b]
-        else RoundCone(corners[a], corners[b], (sizes[a], sizes[b]))
-        for a, b in ends
-    ]
-    return union(parts) if smooth is None else smooth_union(parts, smooth)
+    graph = Struts(nodes, edges, radius)  # type: ignore[arg-type]
+    if smooth is None:
+        return graph
+    return smooth_union([graph.strut(k) for k in range(len(graph.edges))], smooth)
