@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from manifold3d import CrossSection, Manifold
 
     from harnack.fields.solids.mesh_solid import MeshSolid
+    from harnack.fields.solids.primitives import Cylinder
     from harnack.geometry import Volume
 
 __all__ = [
     "box_manifold",
+    "cylinder_manifold",
     "extruded_manifold",
     "from_manifold",
     "grown",
@@ -156,6 +158,22 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
     x, y, z = (float(v) for v in upper - lower)
     a, b, c = (float(v) for v in lower)
     return Manifold.cube((x, y, z)).translate((a, b, c))
+
+
+def cylinder_manifold(cylinder: Cylinder, level: float, tolerance: float) -> Manifold | None:
+    """The points where the function of a cylinder is at most `level`, as a manifold3d solid. None
+    if the level is positive, since the edges of a cylinder that grows are round, or if it has no
+    ends. Vertices lie on the surface; faces are within `tolerance` (a length) of it, since chords
+    of n points around are radius (1 - cos(pi/n)) deep, at most radius (pi/n)^2/2."""
+    from manifold3d import Manifold
+
+    if level > 0 or cylinder.height is None:
+        return None
+    radius, height = cylinder.radius + level, cylinder.height + 2 * level
+    if radius <= 0 or height <= 0:
+        return Manifold()
+    around = max(8, math.ceil(math.pi * math.sqrt(0.5 * radius / tolerance)))
+    return Manifold.cylinder(height, radius, circular_segments=around, center=True)
 
 
 def extruded_manifold(

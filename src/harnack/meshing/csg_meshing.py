@@ -36,7 +36,9 @@ from harnack.fields.solids.extrusions import Extrusion, SolidOfRevolution
 from harnack.fields.solids.from_field import BandSolid, SublevelSolid, bounded_side_extent
 from harnack.fields.solids.from_field import solid as solid_of
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.fields.solids.primitives import Cuboid, Plane
+from harnack.fields.solids.primitives import Cuboid, Cylinder, Plane
+from harnack.fields.solids.round_cones import Capsule, RoundCone
+from harnack.fields.solids.struts import Struts
 from harnack.fields.solids.thread import Thread
 from harnack.fields.solids.transforms import TransformedSolid
 from harnack.fields.solids.tube import Tube
@@ -46,6 +48,7 @@ from harnack.meshing.checks import check_manifold
 from harnack.meshing.clipping import snap_to_box
 from harnack.meshing.closed_mesh import (
     box_manifold,
+    cylinder_manifold,
     extruded_manifold,
     from_manifold,
     mesh_manifold,
@@ -78,6 +81,7 @@ from harnack.meshing.meshing_errors import (
 )
 from harnack.meshing.outlier_projection import project_outliers
 from harnack.meshing.self_intersection_repair import resolve_self_intersections
+from harnack.meshing.strut_mesh import strut_manifold
 from harnack.meshing.thread_mesh import thread_manifold
 from harnack.meshing.triangle_mesh import TriangleMesh
 from harnack.meshing.tube_mesh import tube_manifold
@@ -520,6 +524,14 @@ class CsgMesher:
         ),
         TransformedSolid: _mesh_transformed,
         Cuboid: _mesh_box,
+        Cylinder: lambda self, solid, level: cylinder_manifold(solid, level, self.tolerance),
+        Capsule: lambda self, solid, level: strut_manifold(
+            Struts.of([solid]), level, self.tolerance
+        ),
+        RoundCone: lambda self, solid, level: strut_manifold(
+            Struts.of([solid]), level, self.tolerance
+        ),
+        Struts: lambda self, solid, level: strut_manifold(solid, level, self.tolerance),
         Extrusion: lambda self, solid, level: (
             extruded_manifold(solid.loops, solid.height, solid.twist, solid.taper, self.tolerance)
             if level == 0

@@ -18,6 +18,7 @@ from harnack.backend.elementary import safe_norm
 from harnack.enclosures import LevelGaps, Levels, SlopeRange, choose_enclosures, longest_free_length
 from harnack.fields.batch_evaluation import map_batches
 from harnack.fields.clearance import level_distance_lower_bound
+from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.formula_evaluator import without_alternatives
 from harnack.fields.solids.mesh_solid import share_samples
 from harnack.geometry.mesh_edges import row_norms
@@ -89,6 +90,8 @@ class LevelFunction:
     secant_steps: the number of secant steps that find the point at which an edge of a cell meets
         the level set, for functions that are nearly linear along edges, such as distances. With 0
         it is found by a search.
+    is_near: whether it is sampled near the level set, for which long formulas have shorter lists
+        (`Plan.levels`).
     evaluations: the number of points at which f has been evaluated."""
 
     field: Field
@@ -96,12 +99,14 @@ class LevelFunction:
     most_faces: int = dataclasses.field(default=MOST_FACES, kw_only=True)
     uploads: CallCache = dataclasses.field(default_factory=CallCache, kw_only=True)
     secant_steps: int = dataclasses.field(default=0, kw_only=True)
+    is_near: bool = dataclasses.field(default=False, kw_only=True)
     evaluations: int = dataclasses.field(default=0, init=False)
 
     def __post_init__(self) -> None:
         self._backend = choose_backend("double")
+        plan = Plan((self.level,)) if self.is_near else POINTS
         self._evaluator = self.uploads.get_or_make(
-            self.field, "evaluator", lambda: self.field.evaluator(self._backend)
+            self.field, ("evaluator", plan), lambda: self.field.evaluator(self._backend, plan)
         )
         # Opaque numbers are data of kernels, so that other levels compile nothing.
         level = dr.opaque(self._backend.Float, self.level)

@@ -690,7 +690,7 @@ def _mesh_solid(
         solid.
     mesh_options: the arguments of `mesh`."""
     region = LevelFunction(
-        *solid_and_level(field, solid, level), most_faces=mesh_options.most_faces
+        *solid_and_level(field, solid, level), most_faces=mesh_options.most_faces, is_near=True
     )
     # In a list, so that a nested function can change it.
     angle_evaluations = [0]

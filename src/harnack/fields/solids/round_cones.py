@@ -9,6 +9,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from harnack.arithmetic import cone_distance, norm, segment_distance
 from harnack.backend.validation import as_positive, as_triple
 from harnack.fields.solids.solid import FormulaSolid, Point, box_around, set_frozen
@@ -17,29 +19,46 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.arithmetic.segments import Frame
+    from harnack.backend import BoolArray, FloatArray
     from harnack.geometry import Volume
 
 
-def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> Frame:
-    """The frame of three local coordinates that are 0 at `origin`: the first is along the axis, the
-    other two are at right angles to it and to each other (Duff et al. 2017, "Building an
-    orthonormal basis, revisited").
-
-    axis: a vector (3,) of any length but 0.
-    """
-    length = math.hypot(*axis)
-    x, y, z = (entry / length for entry in axis)
-    sign = math.copysign(1.0, z)
+def axial_frames(origins: FloatArray, axes: FloatArray) -> FloatArray:
+    """The frames (m, 12) (`Frame`) of local coordinates that are 0 at points (m, 3), along vectors
+    (m, 3) of any length but 0, and at right angles to these (Duff et al. 2017, "Building an
+    orthonormal basis, revisited")."""
+    axes = axes / np.abs(axes).max(axis=1)[:, None]  # so that no square underflows
+    x, y, z = (axes / np.linalg.norm(axes, axis=1)[:, None]).T
+    sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
     b = x * y * a
-    rows = (x, y, z), (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
-    o = origin
-    # Adding 0.0 makes -0.0 the number 0.0.
-    return tuple(
-        entry + 0.0
-        for u, v, w in rows
-        for entry in (u, v, w, math.fsum((u * o[0], v * o[1], w * o[2])))
+    rows = (
+        np.stack([x, y, z], axis=1),
+        np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1),
+        np.stack([b, sign + y * y * a, -y], axis=1),
     )
+    columns = [part for row in rows for part in (row, (row * origins).sum(axis=1)[:, None])]
+    return np.concatenate(columns, axis=1) + 0.0  # which makes -0.0 the number 0.0
+
+
+def _axial_frame(origin: Sequence[float], axis: Sequence[float]) -> Frame:
+    """The frame with an origin and an axis (`axial_frames`)."""
+    frames = axial_frames(np.array([origin], np.float64), np.array([axis], np.float64))
+    return tuple(frames[0].tolist())
+
+
+def cone_numbers(length: FloatArray, radii: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Whether one ball of a round cone contains the other, the slope s and s/c (`RoundCone`), for
+    m cones: arrays (m,). For nested balls both numbers are 0.
+
+    length: (m,) the distances of centers. radii: (m, 2) the larger radius first.
+    """
+    difference = radii[:, 0] - radii[:, 1]
+    is_nested = (length <= difference) | (length == 0.0)
+    length, difference = np.where(is_nested, 1.0, length), np.where(is_nested, 0.0, difference)
+    # With a product that loses no digits where both lengths are nearly equal.
+    ratio = difference / np.sqrt((length - difference) * (length + difference))
+    return is_nested, difference / length, ratio
 
 
 @dataclass(frozen=True)
@@ -148,15 +167,10 @@ class RoundCone(FormulaSolid):
         if small > large:
             centers, (large, small) = (end, start), (small, large)
         axis = [b - a for a, b in zip(*centers, strict=True)]
-        length, difference = math.hypot(*axis), large - small
-        is_ball = length <= difference or length == 0.0
-        slope, ratio = 0.0, 0.0
-        if is_ball:
-            axis = [0.0, 0.0, 1.0]
-        else:
-            slope = difference / length
-            # s/c, with a product that loses no digits where both lengths are nearly equal.
-            ratio = difference / math.sqrt((length - difference) * (length + difference))
+        length = math.hypot(*axis)
+        numbers = cone_numbers(np.array([length]), np.array([[large, small]]))
+        is_ball, slope, ratio = (entry.item() for entry in numbers)
+        axis = [0.0, 0.0, 1.0] if is_ball else axis
         set_frozen(self, "_frame", _axial_frame(centers[0], axis))
         set_frozen(self, "_center", centers[0])
         set_frozen(self, "_numbers", (large, length, slope, ratio))

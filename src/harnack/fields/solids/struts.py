@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.arithmetic import minimum
+from harnack.arithmetic import cone_distance, minimum, segment_distance
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend.validation import (
     as_real_array,
@@ -20,12 +20,14 @@ from harnack.backend.validation import (
 )
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.solids.booleans import smooth_union
-from harnack.fields.solids.round_cones import Capsule, RoundCone
+from harnack.fields.solids.round_cones import Capsule, RoundCone, axial_frames, cone_numbers
 from harnack.fields.solids.solid import FormulaSolid, box_around, set_frozen
 from harnack.fields.solids.tube import checked_pairs, checked_radii
 from harnack.fields.tape_evaluator import tape_evaluator
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
     from harnack.backend import Backend, FloatArray, IntArray
@@ -67,6 +69,16 @@ class Struts(FormulaSolid):
     def __repr__(self) -> str:
         return f"Struts({len(self.nodes):,} nodes, {len(self.edges):,} edges)"
 
+    @classmethod
+    def of(cls, parts: Sequence[Capsule | RoundCone]) -> Struts:
+        """The union of capsules and round cones."""
+        nodes = np.array([end for part in parts for end in (part.start, part.end)])
+        radii = [
+            (part.radius, part.radius) if isinstance(part, Capsule) else part.radii
+            for part in parts
+        ]
+        return cls(nodes, np.arange(2 * len(parts)).reshape(-1, 2), np.array(radii).ravel())
+
     def strut(self, number: int) -> Capsule | RoundCone:
         """The strut of the edge with this number."""
         a, b = self.edges[number].tolist()
@@ -77,12 +89,39 @@ class Struts(FormulaSolid):
         return RoundCone(start, end, (first, second))
 
     @functools.cached_property
-    def _parts(self) -> list[Capsule | RoundCone]:
-        """The struts of all edges."""
-        return [self.strut(k) for k in range(len(self.edges))]
+    def _distances(self) -> tuple[tuple[tuple[float, ...], bool], ...]:
+        """For each strut the numbers of its distance and its radius, and whether it is a cone."""
+        radii = self.radii[self.edges]
+        larger = np.where(radii[:, 1] > radii[:, 0], 1, 0)
+        ends = np.stack([larger, 1 - larger], axis=1)
+        radii = np.take_along_axis(radii, ends, axis=1)
+        nodes = np.take_along_axis(self.edges, ends, axis=1)
+        start, end = self.nodes[nodes[:, 0]], self.nodes[nodes[:, 1]]
+        vector = end - start
+        length = np.linalg.norm(vector, axis=1)
+        is_nested, slope, ratio = cone_numbers(length, radii)
+        is_cone = radii[:, 0] != radii[:, 1]
+        # A ball that contains the other one is a capsule without a length.
+        reach = np.where(is_nested, 0.0, 0.5 * length)
+        origins = np.where((is_cone | is_nested)[:, None], start, 0.5 * start + 0.5 * end)
+        frames = axial_frames(origins, vector)
+        capsules = np.column_stack([frames, reach, radii[:, 0]]).tolist()
+        cones = np.column_stack([frames, length, slope, ratio, radii[:, 0]]).tolist()
+        kinds: list[bool] = (is_cone & ~is_nested).tolist()
+        return tuple(
+            (tuple(cone if kind else capsule), kind)
+            for cone, capsule, kind in zip(cones, capsules, kinds, strict=True)
+        )
+
+    def _strut_function(self, number: int, point: tuple[Any, Any, Any]) -> Any:
+        """The function of the strut of an edge."""
+        numbers, is_cone = self._distances[number]
+        if is_cone:
+            return cone_distance(point, numbers[:12], *numbers[12:15]) - numbers[15]
+        return segment_distance(point, numbers[:12], numbers[12]) - numbers[13]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [strut.formula(x, y, z) for strut in self._parts]
+        values = [self._strut_function(k, (x, y, z)) for k in range(len(self.edges))]
         return minimum(*values) if len(values) > 1 else values[0]
 
     @functools.cached_property
@@ -95,11 +134,11 @@ class Struts(FormulaSolid):
         farthest = np.abs(start + end).max(axis=1)
         steepest = np.abs(first - second) / length
         numbers = {int(entries.argmax()) for entries in (farthest, length, steepest)}
-        struts = [self.strut(k) for k in numbers]
 
         def least(x: Any, y: Any, z: Any) -> Any:
             """The least of their functions."""
-            return functools.reduce(minimum, [strut.formula(x, y, z) for strut in struts])
+            values = [self._strut_function(k, (x, y, z)) for k in numbers]
+            return functools.reduce(minimum, values)
 
         return tally_of(least)
 
