@@ -46,7 +46,7 @@ _MIN_INSTRUCTIONS = 40
 _MAX_COMPILED = 300
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
 # along a ray; where that is more than a quarter of the margin of cells, the whole list is run.
-_ROUNDINGS = 512.0
+_ROUNDINGS = 64.0
 
 
 # Whether formulas are compiled, whatever their length (`compiled_formulas`).

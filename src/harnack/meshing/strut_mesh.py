@@ -61,11 +61,13 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold |
     graph = _Graph.of(struts.nodes, edges, radii, tolerance)
     if graph is None:
         return None
+    vertices_of_strut = graph.around * math.ceil(math.pi / graph.step)
+    _check_size(vertices_of_strut, tolerance)
     if _are_stars_apart(graph):
         surface = _joined_stars(graph)
         if surface is not None:
             return to_manifold(surface)
-    _check_size(len(edges) * graph.around * math.ceil(math.pi / graph.step), tolerance)
+    _check_size(len(edges) * vertices_of_strut, tolerance)
     return Manifold.batch_boolean(
         [to_manifold(graph.strut_surface(k)) for k in range(len(edges))], OpType.Add
     )

@@ -414,7 +414,9 @@ def _segment_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) 
     Proof. Let c be the center of a box, and e = (+-e_x, +-e_y, e_z) its half diagonals. Along the
     axis a the box reaches from its center as far as the largest |a . e|. Across it, it reaches as
     far as the largest sqrt(|e|^2 - (a . e)^2): the distance across is convex, and so largest at a
-    corner.
+    corner. And the distance of box and segment is at least the gap between their projections to any
+    line. Lines along the coordinates, and at right angles to the axis and to a coordinate, are
+    taken, as in separating two boxes (Gottschalk et al. 1996).
     """
     half_length, radius = constants[12], constants[13:]
     center, half, slack = _boxes(operands, constants)
@@ -439,7 +441,33 @@ def _segment_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) 
         _norm_on_numpy([np.maximum(q, 0.0), np.maximum(h - half_length, 0.0)], 2.0)
         for q, h in ((from_axis - reach_across, nearest), (from_axis + reach_across, farthest))
     )
-    return _minus_radius((low - slack, high + slack), radius)
+    gap = _gap_of_projections(center, half, constants)
+    return _minus_radius((np.maximum(low, gap) - slack, high + slack), radius)
+
+
+def _gap_of_projections(
+    center: Sequence[FloatArray], half: Sequence[FloatArray], constants: Sequence[FloatArray]
+) -> FloatArray:
+    """The largest gap between the projections of boxes and of segments to some lines
+    (`_segment_ranges`); at most 0 if there is none. center, half: of the boxes."""
+    axis, half_length = constants[:3], constants[12]
+    # From the middle of the segment to the center of the box.
+    away = [
+        center[k] - sum(constants[4 * row + k] * constants[4 * row + 3] for row in range(3))
+        for k in range(3)
+    ]
+    gap: Any = -np.inf
+    for k, other, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        gap = np.maximum(gap, np.abs(away[k]) - half[k] - np.abs(axis[k]) * half_length)
+        u, v = axis[last], axis[other]
+        across = np.abs(u * away[other] - v * away[last])
+        across -= np.abs(u) * half[other] + np.abs(v) * half[last]
+        gap = np.maximum(gap, across / np.maximum(np.hypot(u, v), _SHORT))
+    return gap
+
+
+# Shorter vectors at right angles to a unit vector are too short to be divided by their length.
+_SHORT = 0.25
 
 
 def _cone_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
