@@ -170,6 +170,7 @@ def test_equal_parts_are_interpreted() -> None:
 def fresh_caches(monkeypatch: pytest.MonkeyPatch, shortest: int) -> None:
     """Let formulas of more than `shortest` instructions be interpreted, of all fields."""
     monkeypatch.setattr(tape_evaluator, "_MIN_INSTRUCTIONS", shortest)
+    monkeypatch.setattr(tape_evaluator, "_MAX_OPERATIONS", 10**9)
     for name in ("_TAPES", "_CELLS"):
         monkeypatch.setattr(tape_evaluator, name, FieldCache())
 
