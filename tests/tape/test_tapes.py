@@ -3,6 +3,7 @@ formulas themselves."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,9 @@ FORMULAS: dict[str, Any] = {
         hk.math.sqrt(x * x + 4 * y * y + z * z) - hk.math.norm(x, y, p=4.0) + hk.math.norm(x, 2.0)
     ),
     "sums": lambda x, y, z: (x + y + z - 0.1) + (x - y) * 0.3 + (x + 0.2) + x * 2.0 - z / 3.0,
+    "multiples of one sum": lambda x, y, z: (
+        (x + y + z + 0.1) + (x + y + z + 0.1) * 0.3 + (x - y + z + 0.7) * 0.1 * (x + y)
+    ),
     "nested": lambda x, y, z: hk.math.minimum(
         hk.math.maximum(abs(x) - 0.5, -abs(y) + 0.2), hk.math.maximum(x - y, y - x) - z
     ),
@@ -109,9 +113,64 @@ def test_cells_have_the_values_that_matter(seed: int, levels: tuple[float, ...])
     assert lengths.mean() < (0.4 if levels else 0.6) * len(tape)
 
 
+def test_numbers_that_overflow_are_recorded_as_they_are() -> None:
+    p = np.array([[0.5, -0.25, 1.0]])
+    formulas: list[Any] = [
+        lambda x, y, z: x * 1e308 * 1e308,
+        lambda x, y, z: x + 1e308 + 1e308 + y,
+        lambda x, y, z: x / 1e-320,
+        lambda x, y, z: hk.math.minimum(x + math.inf, y),
+        lambda x, y, z: x * math.inf,
+    ]
+    with np.errstate(over="ignore"):
+        for formula in formulas:
+            tape = record(formula)
+            np.testing.assert_array_equal(
+                values_of(tape, BoxTapes.whole(tape), 0, p), formula(*p.T) + 0.0 * p[:, 0]
+            )
+
+
+@pytest.mark.parametrize(
+    ("lines", "text"),
+    [("a const 0\nb recip a", "divides by zero"), ("x var-x\na const 0\nb div x a", "by zero")],
+)
+def test_formulas_in_files_that_divide_by_zero_are_refused(
+    tmp_path: Path, lines: str, text: str
+) -> None:
+    path = tmp_path / "a.vm"
+    path.write_text(lines)
+    with pytest.raises(ValueError, match=text):
+        hk.expression.from_vm(path)
+
+
+def test_blends_within_blends_are_not_steep() -> None:
+    """A blend has a Lipschitz constant. Estimated from its formula, its slope grew with every blend
+    within another, and rays took a hundred times as long."""
+    centers = np.random.default_rng(0).uniform(-1, 1, (40, 3)).tolist()
+    spheres = [hk.Sphere(0.05, tuple(c)) for c in centers]
+    blend = hk.smooth_union(spheres, 0.1)
+    for model in (blend, hk.smooth_union([blend.shell(0.01), *spheres[:4]], 0.1)):
+        evaluator: Any = model.evaluator(choose_backend("single"))
+        assert isinstance(evaluator, tape_evaluator.TapeEvaluator)
+        assert not evaluator.is_steep
+    step = hk.expression("max(-1, min(1, 1e9 * y))", domain=hk.Box((-1, -1, -1), (1, 1, 1)))
+    steep = hk.smooth_union([*spheres, hk.solid(step, below=0.0)], 0.1)
+    assert steep.evaluator(choose_backend("single")).is_steep
+
+
+def test_equal_parts_are_interpreted() -> None:
+    """They are a single instruction, but would be compiled one by one, for hours."""
+    model = hk.smooth_union([hk.Sphere(1.0) for _ in range(300)], 0.1)
+    assert isinstance(model.evaluator(choose_backend("single")), tape_evaluator.TapeEvaluator)
+    hits = hk.trace(model, [[0.0, 0.0, 5.0]], [[0.0, 0.0, -1.0]])
+    # In r - f, a blend is the root of the sum of squares.
+    assert float(hits.t[0]) == pytest.approx(5 - 1 - 0.1 * (1 - 300**-0.5), abs=3e-4)
+
+
 def fresh_caches(monkeypatch: pytest.MonkeyPatch, shortest: int) -> None:
     """Let formulas of more than `shortest` instructions be interpreted, of all fields."""
     monkeypatch.setattr(tape_evaluator, "_MIN_INSTRUCTIONS", shortest)
+    monkeypatch.setattr(tape_evaluator, "_MAX_OPERATIONS", 10**9)
     for name in ("_TAPES", "_CELLS"):
         monkeypatch.setattr(tape_evaluator, name, FieldCache())
 

@@ -42,6 +42,9 @@ __all__ = ["TapeEvaluator", "compiled_formulas", "recorded_tape", "tape_evaluato
 # Formulas of more instructions are interpreted, and combinations of more than half as many, since
 # much of them is left out in each cell; shorter ones are compiled.
 _MIN_INSTRUCTIONS = 40
+# Equal operations, as of equal parts, are one instruction, but are compiled once for each part.
+# Formulas of more operations, where equal ones count each time, are interpreted.
+_MAX_OPERATIONS = 80
 # Formulas of more instructions are not compiled, even where they cannot be interpreted.
 _MAX_COMPILED = 300
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
@@ -101,12 +104,13 @@ def tape_evaluator(
     if shortest is None:
         is_single = hasattr(cast("Any", type(field)), "tally")
         shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
-    if tape is None or len(tape) <= shortest:
+    if tape is None or (len(tape) <= shortest and tape.call_count <= _MAX_OPERATIONS):
         return None
     if _ONLY_COMPILED.get():
-        if len(tape) > _MAX_COMPILED:
+        count = max(len(tape), tape.call_count)
+        if count > _MAX_COMPILED:
             raise NotImplementedError(
-                f"a formula of {len(tape):,} instructions takes minutes to compile, and pages and "
+                f"a formula of {count:,} instructions takes minutes to compile, and pages and "
                 "other GPUs cannot interpret it yet: render it here, or show its mesh "
                 "(harnack.mesh)"
             )
@@ -397,15 +401,20 @@ class _ListEvaluator(FormulaEvaluator):
 def _tallies_of(field: Any) -> Iterator[tuple[Tally, float]]:
     """For each part of a field the summary of its operations, and the number within which it counts
     as abrupt if it may turn (`FormulaEvaluator.is_abrupt`). Combinations turn no faster than their
-    parts, of which each is judged by itself, as their own evaluators would judge it."""
-    tally: Tally | None = getattr(field, "tally", None)
-    parts = getattr(field, "parts", None)
-    inner = getattr(field, "field", None)
-    if tally is None and parts:
+    parts, of which each is judged by itself, as their own evaluators would judge it. Blends are no
+    steeper than 2^(1/p) times their steepest part, which their Lipschitz constant says. (A summary
+    of their whole formula would estimate slopes that grow by a factor with every blend within
+    another.)"""
+    parts: Any = getattr(field, "parts", None) or ()
+    inner, lipschitz = getattr(field, "field", None), getattr(field, "lipschitz", None)
+    has_tally = hasattr(cast("Any", type(field)), "tally")
+    if parts and all(isinstance(part, Field) for part in parts):
+        if has_tally and lipschitz is not None:
+            yield Tally(steepest=float(lipschitz)), 1.0
         for part in parts:
             yield from _tallies_of(part)
-    elif tally is None and isinstance(inner, Field):
+    elif not has_tally and isinstance(inner, Field):
         yield from _tallies_of(inner)
     else:
-        tally = tally_of(field.formula) if tally is None else tally
-        yield tally, 1.0 if getattr(field, "lipschitz", None) is not None else tally.finest
+        tally: Tally = field.tally if has_tally else tally_of(field.formula)
+        yield tally, tally.finest if lipschitz is None else 1.0

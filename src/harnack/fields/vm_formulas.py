@@ -96,7 +96,11 @@ class VmFormula:
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         """The value of the formula at coordinates of any kind: numbers, NumPy or Dr.Jit arrays, or
-        numbers with proved ranges."""
+        numbers with proved ranges.
+
+        Raises:
+            ValueError: a constant part divides by zero, or is too large.
+        """
         coordinates = dict(zip(_COORDINATES, (x, y, z), strict=True))
         results: list[Any] = []
         for operation, operands in self.instructions:
@@ -106,7 +110,12 @@ class VmFormula:
                 results.append(coordinates[operation])
             else:
                 function = _OPERATIONS[operation][1]
-                results.append(function(*(results[k] for k in operands)))
+                try:
+                    results.append(function(*(results[k] for k in operands)))
+                except ZeroDivisionError:
+                    raise ValueError(f"{self.name} divides by zero") from None
+                except OverflowError:
+                    raise ValueError(f"{self.name} has a number that is too large") from None
         return results[-1]
 
     def __repr__(self) -> str:

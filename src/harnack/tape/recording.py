@@ -5,6 +5,7 @@ instructions, each with an operation, operands (earlier instructions) and consta
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -50,6 +51,8 @@ class Tape:
     operands: (n, 3) the instructions that are its operands, all before it; -1 for none.
     constants: (n, c) its constants, 0 where there are fewer.
     result: the instruction whose result is the value of the formula.
+    call_count: how many operations the formula did, where equal ones, which are one instruction,
+        count each time.
     """
 
     operations: tuple[Operation, ...]
@@ -57,6 +60,7 @@ class Tape:
     operands: IntArray
     constants: FloatArray
     result: int
+    call_count: int
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -87,17 +91,19 @@ def _coordinate_rows() -> list[_Row]:
 @dataclass(eq=False)
 class _Recorder:
     """Instructions in the order in which they were recorded. Equal instructions are recorded
-    once."""
+    once; call_count counts them all."""
 
     operations: list[Operation] = field(default_factory=list[Operation])
     rows: list[_Row] = field(default_factory=_coordinate_rows)
     kind_of: dict[str, int] = field(default_factory=dict[str, int])
     index_of: dict[Any, int] = field(default_factory=dict[Any, int])
+    call_count: int = 0
 
     def add(
         self, operation: Operation, operands: tuple[int, ...], constants: tuple[float, ...] = ()
     ) -> int:
         """Add an instruction, and return its index."""
+        self.call_count += 1
         key = operation.name, operands, constants
         index = self.index_of.get(key)
         if index is None:
@@ -135,7 +141,9 @@ class _Recorder:
             operands[k, : len(row_operands)] = [new_index[j] for j in row_operands]
             constants[k, : len(row_constants)] = row_constants
         kinds = np.array([kind for kind, _, _ in rows], np.int64)
-        return Tape(tuple(self.operations), kinds, operands, constants, new_index[result])
+        return Tape(
+            tuple(self.operations), kinds, operands, constants, new_index[result], self.call_count
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +234,10 @@ class TapeNumber(FormulaNumber):
         if both or len(a.terms) + len(b.terms) > _MAX_TERMS:
             a, b = (entry if len(entry.terms) <= 1 and not both else entry.recorded
                     for entry in (a, b))  # fmt: skip
-            if a.terms and b.terms and a.terms[0][0] == b.terms[0][0]:  # a number and itself
-                return a._scaled(2.0)
+            if a.terms and b.terms and a.terms[0][0] == b.terms[0][0]:
+                a, b = a.recorded, b.recorded
+                if a.index == b.index:  # a number and itself
+                    return a._scaled(2.0)
         roots = self.roots + other.roots if self.roots and other.roots else ()
         return TapeNumber(self.recorder, a.terms + b.terms, a.shift + b.shift, roots)
 
@@ -239,7 +249,8 @@ class TapeNumber(FormulaNumber):
         numbers = (*(entry for _, entry in self.terms), self.shift)
         base = self if all(_is_exact_product(n, factor) for n in numbers) else self.recorded
         terms = tuple((index, entry * factor) for index, entry in base.terms)
-        return TapeNumber(self.recorder, terms, base.shift * factor)
+        shift = base.shift * factor if base.shift else 0.0  # not NaN for an infinite factor
+        return TapeNumber(self.recorder, terms, shift)
 
     def product(self, other: TapeNumber) -> TapeNumber:
         """The product of this number and another one."""
@@ -354,13 +365,18 @@ class TapeNumber(FormulaNumber):
 
 
 def _is_exact_sum(a: float, b: float) -> bool:
-    """Whether the sum of two numbers is not rounded."""
-    return a == 0.0 or b == 0.0 or Fraction(a) + Fraction(b) == Fraction(a + b)
+    """Whether the sum of two numbers is not rounded. (An infinite one is, or counts as rounded.)"""
+    if a == 0.0 or b == 0.0:
+        return True
+    return math.isfinite(a + b) and Fraction(a) + Fraction(b) == Fraction(a + b)
 
 
 def _is_exact_product(a: float, b: float) -> bool:
-    """Whether the product of two numbers is not rounded."""
-    return abs(b) == 1.0 or abs(a) == 1.0 or Fraction(a) * Fraction(b) == Fraction(a * b)
+    """Whether the product of two numbers is not rounded. (An infinite one is, or counts as
+    rounded.)"""
+    if abs(a) == 1.0 or abs(b) == 1.0:
+        return True
+    return math.isfinite(a * b) and Fraction(a) * Fraction(b) == Fraction(a * b)
 
 
 def record(formula: Callable[[Any, Any, Any], Any]) -> Tape:
