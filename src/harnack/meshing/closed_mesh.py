@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 __all__ = [
+    "ball_manifold",
     "box_manifold",
     "cylinder_manifold",
     "extruded_manifold",
@@ -286,13 +287,13 @@ def volume_manifold(
             manifold = manifold.trim_by_plane((-x, -y, -z), -h)
         return manifold
     if isinstance(volume, Ball):
-        return manifold ^ _ball_manifold(volume, tolerance)
+        return manifold ^ ball_manifold(volume, tolerance)
     raise MeshingError(
         f"{with_article(type(volume).__name__)} cannot cut a mesh: give a box or a ball"
     )
 
 
-def _ball_manifold(ball: Ball, tolerance: float) -> Manifold:
+def ball_manifold(ball: Ball, tolerance: float) -> Manifold:
     """A ball as a manifold3d solid: a geodesic polyhedron whose vertices lie on the sphere and
     whose faces are within `tolerance` (a length) of it.
 

@@ -36,7 +36,7 @@ from harnack.fields.solids.extrusions import Extrusion, SolidOfRevolution
 from harnack.fields.solids.from_field import BandSolid, SublevelSolid, bounded_side_extent
 from harnack.fields.solids.from_field import solid as solid_of
 from harnack.fields.solids.mesh_solid import MeshSolid
-from harnack.fields.solids.primitives import Cuboid, Cylinder, Plane
+from harnack.fields.solids.primitives import Cuboid, Cylinder, Plane, Sphere
 from harnack.fields.solids.round_cones import Capsule, RoundCone
 from harnack.fields.solids.struts import Struts
 from harnack.fields.solids.thread import Thread
@@ -47,6 +47,7 @@ from harnack.meshing.bcc_lattice import BccLattice
 from harnack.meshing.checks import check_manifold
 from harnack.meshing.clipping import snap_to_box
 from harnack.meshing.closed_mesh import (
+    ball_manifold,
     box_manifold,
     cylinder_manifold,
     extruded_manifold,
@@ -262,9 +263,21 @@ class CsgMesher:
             else:
                 self.intersected_with = (*previous, *((operand, level) for operand in others))
         try:
+            if isinstance(part, Sphere):
+                return self._mesh_ball(part, level)
             return self.mesh_sublevel(part, level)
         finally:
             self.intersected_with = previous
+
+    def _mesh_ball(self, sphere: Sphere, level: float) -> Manifold:
+        """Mesh the set {sphere <= level} as an operand: of a union of many spheres, level sets in
+        cells would take most of the time."""
+        from manifold3d import Manifold
+
+        radius = sphere.radius + level
+        return (
+            ball_manifold(Ball(sphere.center, radius), self.tolerance) if radius > 0 else Manifold()
+        )
 
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """Mesh the level set of `function` in the cells of `lattice`; returns a closed mesh.
