@@ -158,17 +158,20 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     side = dr.select(value_to_level > 0, tracer.backend.Float(1), -1)
     if trace.side is not None:  # hits at crossings are at a root
         newton_step, side = dr.zeros(type(newton_step)), trace.side
-    # Rays without a hit may have t = inf: they are evaluated at their origin.
+    # Rays without a hit may have t = inf: they keep their origin.
     t = dr.maximum(dr.select(is_hit, trace.t, 0) + newton_step, 0)
     position = dr.fma(vector(t), d, o)
     if has_jumps:
         sample = _sample_where(tracer, position, trace.value, d, is_smooth)
     else:
-        sample = tracer.sample(position)
+        # A point that is no number costs nothing; one outside of a field's cells costs the most.
+        sample = tracer.sample(dr.select(is_hit, position, dr.nan))
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
     # A field may have another normal for shading than its gradient.
     shading_normal = normal if sample.shading_normal is None else sample.shading_normal
+    shading_normal = dr.select(is_hit, shading_normal, -d)
+    value = dr.select(is_hit, sample.value, trace.value)
     uncertainty = _uncertainty(tracer, sample.gradient, t, sample.value, sample.value_error)
     # Second movement: along the gradient, by the distance to the level to first order.
     correction = tracer.levels.offset_to_nearest(sample.value) / gradient_norm
@@ -186,7 +189,7 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         position=dr.fma(vector(correction), normal, position),
         normal=orient_normal(shading_normal, d, side),
         ray_offset=RAY_OFFSET * uncertainty,
-        value=sample.value,
+        value=value,
         evaluations=trace.evaluations + dr.select(is_smooth, tracer.backend.UInt32(1), 0),
         is_hole_filling=is_smooth & has_jumps,
         is_on_section=tracer.backend.Bool(False),
