@@ -14,6 +14,7 @@ and one piece for formulas.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -244,7 +245,21 @@ ONE = Interval(1.0, 1.0)
 
 def machine_epsilon(x: Real) -> float:
     """The distance from 1 to the next number, in the precision of x."""
-    return float(dr.epsilon(type(x))) * 2 if dr.is_array_v(cast("Any", type(x))) else 2.0**-52
+    return _limits_of(cast("Any", type(x)))[0]
+
+
+def smallest_normal(x: Real) -> float:
+    """The smallest normal number in the precision of x, a Dr.Jit number; 0 for a Python number."""
+    return _limits_of(cast("Any", type(x)))[1]
+
+
+@functools.cache
+def _limits_of(kind: type[Any]) -> tuple[float, float]:
+    """`machine_epsilon` and `smallest_normal` of numbers of a type. (Dr.Jit's own functions take as
+    long as recording an operation.)"""
+    if dr.is_array_v(kind):
+        return float(dr.epsilon(kind)) * 2, float(dr.smallest(kind))
+    return 2.0**-52, 0.0
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
@@ -269,8 +284,8 @@ def _round_up(x: Real, units: float = 1.0) -> Real:
 def _pad_underflow(x: Real, sign: int) -> Real:
     """The computed product x, moved up (sign 1) or down (-1) by the largest error that underflow
     causes. A Python float stays as it is."""
-    kind = cast("Any", type(x))
-    return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
+    smallest = smallest_normal(x)
+    return x + sign * smallest if smallest else x
 
 
 def _outward_single(low: float, high: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
+from harnack.arithmetic.functions import absolute, power, sqrt_range
 from harnack.arithmetic.interval import ONE, Interval
 from harnack.arithmetic.jet import Jet, wronskian_range
 from harnack.arithmetic.operators import FormulaNumber
@@ -240,9 +240,8 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
     sizes: the numbers.
     """
-    # (The first result of `ranges` is the range of the function itself.)
     if p == 2.0:
-        return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
+        return sqrt_range(_total([Interval.point(size).square() for size in sizes]))
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
     tiny = float(dr.smallest(cast("Any", type(largest))))
     # Divided by the largest, so that no power overflows.
@@ -277,8 +276,7 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
     length: the range of N.
     """
-    # The range of the reciprocal itself, without those of its derivatives.
-    inverse = reciprocal.ranges(length)[0]
+    inverse = length.reciprocal()
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), inverse.upper)
 

@@ -23,6 +23,7 @@ from harnack.backend import Mask, Real, Vec3
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active, update_where_active
 from harnack.enclosures.samples import Sample
+from harnack.fields.formula_evaluator import without_alternatives
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
@@ -165,7 +166,8 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         sample = _sample_where(tracer, position, trace.value, d, is_smooth)
     else:
         # A point that is no number costs nothing; one outside of a field's cells costs the most.
-        sample = tracer.sample(dr.select(is_hit, position, dr.nan))
+        with without_alternatives():
+            sample = tracer.sample(dr.select(is_hit, position, dr.nan))
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
     # A field may have another normal for shading than its gradient.
