@@ -33,7 +33,10 @@ def values_of(tape: Tape, lists: BoxTapes, index: int, p: Any) -> Any:
             results[entry] = p[:, instruction]
             continue
         operation = tape.operations[kind]
-        operands = [results[int(k)] for k in lists.operands[: operation.operand_count, entry]]
+        operands: list[Any] = [*p.T]
+        if not operation.is_of_point:
+            columns = lists.operands[: operation.operand_count, entry]
+            operands = [results[int(k)] for k in columns]
         constants = tape.constants[instruction, : operation.constant_count].tolist()
         results[entry] = operation.apply(operands, constants) + 0.0 * p[:, 0]
     return results[entries[-1]]

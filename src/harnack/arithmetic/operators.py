@@ -408,6 +408,25 @@ class OperationCounter(FormulaNumber):
             self.tally, is_constant=True, is_square=is_positive, size=size, rate=0.0
         )
 
+    def __add__(self, other: Any) -> Any:
+        if isinstance(other, int | float):
+            return self._shifted(float(other), is_square=self.is_square and other >= 0)
+        return super().__add__(other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        if isinstance(other, int | float):
+            return self._shifted(float(other), is_square=False)
+        return super().__sub__(other)
+
+    def _shifted(self, x: float, *, is_square: bool) -> OperationCounter:
+        """The sum of this number and the constant x or -x, as of two numbers."""
+        b = self.constant(x)
+        farthest = max(b.size, self.size) if self.is_constant else b.size
+        self.tally.farthest = max(self.tally.farthest, farthest)
+        return self._after(_SUM, b, self.size + b.size, self.rate, is_square=is_square)
+
     def sum(self, other: OperationCounter) -> OperationCounter:
         """The sum of this number and another one. The largest absolute value of a constant that is
         added is kept as the tally's `farthest`."""
