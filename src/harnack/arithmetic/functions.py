@@ -8,6 +8,7 @@ NumPy arrays, and Python numbers."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from harnack.arithmetic.interval import (
     ZERO,
     Interval,
     machine_epsilon,
+    pad_underflow,
+    round_down,
+    round_up,
     smallest_normal,
     typed_select,
 )
@@ -176,6 +180,20 @@ def sqrt_range(x: Interval) -> Interval:
         typed_select(is_none, dr.nan, fmax(root.lower, 0), like),
         typed_select(is_none, dr.nan, root.upper, like),
     )
+
+
+def length_bound(sizes: list[Real], sign: int) -> Real:
+    """A bound of the Euclidean norm of numbers of the backend, all >= 0: a lower bound for sign -1,
+    an upper bound for sign 1. It is that end of `sqrt_range` of the sum of their squares, without
+    the operations of the other end."""
+    relative, absolute = _MAX_ULP_ERROR * machine_epsilon(sizes[0]), smallest_normal(sizes[0])
+    if sign > 0:
+        squares = [round_up(pad_underflow(size * size, 1)) for size in sizes]
+        root = dr.sqrt(functools.reduce(lambda a, b: round_up(a + b), squares))
+        return round_up(root + relative * dr.abs(root) + absolute)
+    squares = [fmax(round_down(pad_underflow(size * size, -1)), 0.0) for size in sizes]
+    root = dr.sqrt(fmax(functools.reduce(lambda a, b: round_down(a + b), squares), 0.0))
+    return fmax(round_down(root - relative * dr.abs(root) - absolute), 0.0)
 
 
 def _sqrt(x: Interval) -> DerivativeRanges:
