@@ -337,9 +337,11 @@ class CappedSolid:
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
         return cls(tracer, low, high)
 
-    def _contains(self, p: Vec3) -> Mask:
-        """Return the mask of points p (3,) of the volume that belong to the solid."""
-        value = self.tracer.sample(p).value
+    def _contains(self, p: Vec3, active: Mask) -> Mask:
+        """Return the mask of points p (3,) of the volume that belong to the solid. On lanes that
+        are not active it costs nothing, and is False."""
+        with without_alternatives():
+            value = self.tracer.sample(dr.select(active, p, dr.nan)).value
         # `level_counts` leaves out other components if only the largest one is drawn.
         return (value >= self.low) & (value <= self.high) & self.tracer.level_counts(p)
 
@@ -366,9 +368,8 @@ class CappedSolid:
         # which points belong to it. Such rays are not resolved, and run out of steps in
         # `_meet_levels`.
         is_resolved = self.tracer.is_resolved(o, t_leave)
-        starts_inside = (
-            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
-        )
+        is_known = meets_volume & is_resolved
+        starts_inside = is_known & self._contains(self._point_on_ray(o, d, t_enter), is_known)
         origin_is_inside = starts_inside & (t_enter <= 0)
         # The ray should start inside (side < 0) or outside (side > 0), and does not.
         is_on_wrong_side = (
@@ -439,9 +440,8 @@ class CappedSolid:
         # Rays for which rounding leaves in doubt what belongs to the solid are not resolved;
         # `occluded` counts them as hits.
         is_resolved = self.tracer.is_resolved(o, t_leave)
-        starts_inside = (
-            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
-        )
+        is_known = meets_volume & is_resolved
+        starts_inside = is_known & self._contains(self._point_on_ray(o, d, t_enter), is_known)
         hits_cap = starts_inside & ((t_enter > 0) | (t_leave < t_max))
         # All other rays are tested from t = 0 to t_max.
         return hits_cap | self.tracer.occluded(o, d, 0, t_max, active & ~hits_cap)
