@@ -65,13 +65,13 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
 @pytest.mark.parametrize("side", [None, "below"])
 def test_rays_without_a_hit_are_sampled_nowhere(side: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """At their origins, far from all parts, a model of many parts would be run as a whole."""
-    backend, sampled, sample = choose_backend("double"), [], SurfaceTracer.sample
+    backend, sampled, sample = choose_backend("double"), [], SurfaceTracer.sample_where
 
-    def noted(self: SurfaceTracer, p: Any) -> Any:
-        sampled.append(p)
-        return sample(self, p)
+    def noted(self: SurfaceTracer, p: Any, active: Any) -> Any:
+        sampled.append(active)
+        return sample(self, p, active)
 
-    monkeypatch.setattr(SurfaceTracer, "sample", noted)
+    monkeypatch.setattr(SurfaceTracer, "sample_where", noted)
     surface = traced_surface(hk.Sphere(1.0), side=side)
     placed = PlacedSurface.of(surface, Placement.identity(), backend)
     o = np.array([[0.0, 0.0, 9.0], [0.0, 0.5, 9.0], [0.0, 2.0, 9.0]])
@@ -81,8 +81,8 @@ def test_rays_without_a_hit_are_sampled_nowhere(side: Any, monkeypatch: pytest.M
     )
     assert to_numpy(met.is_hit).tolist() == [True, True, False]
     assert len(sampled) == (1 if side is None else 2)
-    for p in sampled:
-        assert np.isnan(to_numpy(p)).all(axis=1).tolist() == [False, False, True]
+    for active in sampled:
+        assert to_numpy(active).tolist() == [True, True, False]
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ from harnack.backend import Mask, Real, Vec3
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active, update_where_active
 from harnack.enclosures.samples import Sample
-from harnack.fields.formula_evaluator import without_alternatives
 from harnack.tracer import RayStatus
 
 if TYPE_CHECKING:
@@ -165,9 +164,7 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     if has_jumps:
         sample = _sample_where(tracer, position, trace.value, d, is_smooth)
     else:
-        # A point that is no number costs nothing; one outside of a field's cells costs the most.
-        with without_alternatives():
-            sample = tracer.sample(dr.select(is_hit, position, dr.nan))
+        sample = tracer.sample_where(position, is_hit)
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
     # A field may have another normal for shading than its gradient.
@@ -338,10 +335,9 @@ class CappedSolid:
         return cls(tracer, low, high)
 
     def _contains(self, p: Vec3, active: Mask) -> Mask:
-        """Return the mask of points p (3,) of the volume that belong to the solid. On lanes that
-        are not active it costs nothing, and is False."""
-        with without_alternatives():
-            value = self.tracer.sample(dr.select(active, p, dr.nan)).value
+        """Return the mask of points p (3,) of the volume that belong to the solid; anything on
+        lanes that are not active."""
+        value = self.tracer.sample_where(p, active).value
         # `level_counts` leaves out other components if only the largest one is drawn.
         return (value >= self.low) & (value <= self.high) & self.tracer.level_counts(p)
 
