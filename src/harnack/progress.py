@@ -3,15 +3,12 @@ A task tells by fractions how much of it is finished, or by texts what is being 
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any, cast
-
-from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
 
 # Seconds between lines of text. A task that is finished sooner writes none.
 _SECONDS_BETWEEN_LINES = 5.0
@@ -78,12 +75,22 @@ def show_progress(name: str, progress: bool | ProgressFunction) -> Generator[Pro
         callable(progress) or isinstance(cast("Any", progress), bool)
     ):
         raise TypeError(f"progress must be True, False or a function, not {progress!r:.60}")
-    console = Console(stderr=True)
     if callable(progress):
         yield ProgressReporter(name, progress)
-    elif not progress:
+        return
+    if not progress:
         yield ProgressReporter(name, lambda progress: None)
-    elif console.is_terminal and not console.is_jupyter:
+        return
+    if not _may_be_terminal():
+        yield ProgressReporter(name, _TextLines(name))
+        return
+    # Imported here, as it takes time, and log files need none of it.
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    if console.is_terminal and not console.is_jupyter:
         columns = (TextColumn("{task.description}", markup=False), BarColumn(),
                    TaskProgressColumn(), TimeRemainingColumn())  # fmt: skip
         with Bar(*columns, console=console, transient=True) as bar:
@@ -99,6 +106,12 @@ def show_progress(name: str, progress: bool | ProgressFunction) -> Generator[Pro
             yield ProgressReporter(name, show)
     else:
         yield ProgressReporter(name, _TextLines(name))
+
+
+def _may_be_terminal() -> bool:
+    """Whether stderr may be a terminal, which `rich` decides. If not, it is none."""
+    forced = any(os.environ.get(name) for name in ("FORCE_COLOR", "TTY_COMPATIBLE"))
+    return forced or (sys.stderr is not None and sys.stderr.isatty())
 
 
 class _TextLines:

@@ -14,7 +14,7 @@ import pytest
 
 import harnack as hk
 from harnack.arithmetic import ZERO, Interval, Jet, Values, maximum, minimum, norm, power
-from harnack.arithmetic.functions import ElementaryFunction
+from harnack.arithmetic.functions import ElementaryFunction, length_bound, sqrt_range
 from harnack.backend import choose_backend
 
 Long = np.longdouble
@@ -510,6 +510,17 @@ def test_ends_that_are_no_number_stay_unknown(precision: Any) -> None:
     assert (high.intersect(both).upper[0], both.intersect(low).lower[0]) == (1, -1)
     assert dr.isnan(high.max_abs)[0]
     assert dr.isnan(low.max_abs)[0]
+
+
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_bounds_of_lengths_are_the_ends_of_ranges_of_roots(precision: Any) -> None:
+    backend = choose_backend(precision)
+    sizes = [0.0, 1e-300, 1e-30, 0.1, 1.0, 3.0, 1e30, math.inf, math.nan]
+    numbers = [backend.Float(part) for part in np.array([*itertools.product(sizes, repeat=3)]).T]
+    squares = [Interval.point(number).square() for number in numbers]
+    expected = sqrt_range(squares[0] + squares[1] + squares[2])
+    for sign, end in ((-1, expected.lower), (1, expected.upper)):
+        np.testing.assert_array_equal(length_bound(numbers, sign), end)
 
 
 def test_roots_of_sums_of_squares_have_the_slopes_of_norms() -> None:

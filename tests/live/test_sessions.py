@@ -21,7 +21,6 @@ from harnack.live.live_scene import LiveScene, state_delta
 from harnack.live.session import MessageHandler, RequestError, Session
 from harnack.live.sliders import extreme_slider_values
 from harnack.meshing.meshing_errors import LocalizedMeshingError
-from harnack.rendering import studio_surfaces
 
 LOOP = example_curves.torus_knot(2, 3, 18)
 FIELD = hk.SolidAngle(LOOP)
@@ -171,7 +170,7 @@ def test_a_thickness_that_fails_says_at_which_place(monkeypatch: pytest.MonkeyPa
             raise LocalizedMeshingError("sheets meet", np.zeros((1, 3)))
         return trimesh.creation.icosphere(1)
 
-    monkeypatch.setattr(studio_surfaces, "mesh", fail)
+    monkeypatch.setattr(hk.meshing, "mesh", fail)
     live = LiveScene.of(FIELD, {"level": 6.0, "thickness": hk.Slider(0.1, 0.3, 0.1)})
     asked = {"kind": "change", "sliders": {"thickness": 0.3}}
     wrong = r"at the place thickness=0\.3 .*thickness=0\.3: sheets meet; give another thickness"

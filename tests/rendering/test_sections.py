@@ -1,6 +1,7 @@
 """Surfaces opened by a section: what is left, faces of solids there, and what these are made of."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.cli.arguments import parse
 from harnack.rendering import mitsuba_shape
 from harnack.rendering.placed_surface import PlacedSurface, Placement
-from harnack.tracer import traced_surface
+from harnack.tracer import SurfaceTracer, traced_surface
 
 NORMAL, OFFSET = np.array([0.6, 0.0, 0.8]), 0.2
 HALF = hk.HalfSpace((0.6, 0.0, 0.8), OFFSET)
@@ -59,6 +60,29 @@ def test_what_lies_beyond_a_section_is_not_hit(precision):
     np.testing.assert_array_equal(hits.is_hit[decided], np.isfinite(t[decided]))
     both = decided & hits.is_hit
     np.testing.assert_allclose(hits.t[both], t[both], atol=1e-3)
+
+
+@pytest.mark.parametrize("side", [None, "below"])
+def test_rays_without_a_hit_are_sampled_nowhere(side: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At their origins, far from all parts, a model of many parts would be run as a whole."""
+    backend, sampled, sample = choose_backend("double"), [], SurfaceTracer.sample_where
+
+    def noted(self: SurfaceTracer, p: Any, active: Any) -> Any:
+        sampled.append(active)
+        return sample(self, p, active)
+
+    monkeypatch.setattr(SurfaceTracer, "sample_where", noted)
+    surface = traced_surface(hk.Sphere(1.0), side=side)
+    placed = PlacedSurface.of(surface, Placement.identity(), backend)
+    o = np.array([[0.0, 0.0, 9.0], [0.0, 0.5, 9.0], [0.0, 2.0, 9.0]])
+    d = np.tile([0.0, 0.0, -1.0], (3, 1))
+    met = placed.intersect(
+        to_vector3(backend, o), to_vector3(backend, d), backend.Float(1e3), backend.Bool(True)
+    )
+    assert to_numpy(met.is_hit).tolist() == [True, True, False]
+    assert len(sampled) == (1 if side is None else 2)
+    for active in sampled:
+        assert to_numpy(active).tolist() == [True, True, False]
 
 
 @pytest.mark.slow

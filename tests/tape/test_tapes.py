@@ -33,7 +33,10 @@ def values_of(tape: Tape, lists: BoxTapes, index: int, p: Any) -> Any:
             results[entry] = p[:, instruction]
             continue
         operation = tape.operations[kind]
-        operands = [results[int(k)] for k in lists.operands[: operation.operand_count, entry]]
+        operands: list[Any] = [*p.T]
+        if not operation.is_of_point:
+            columns = lists.operands[: operation.operand_count, entry]
+            operands = [results[int(k)] for k in columns]
         constants = tape.constants[instruction, : operation.constant_count].tolist()
         results[entry] = operation.apply(operands, constants) + 0.0 * p[:, 0]
     return results[entries[-1]]
@@ -81,6 +84,16 @@ def test_lists_of_boxes_have_the_values_of_the_formula(name: str) -> None:
         )
         assert (pruned.low[k] <= exact + 1e-12).all()
         assert (pruned.high[k] >= exact - 1e-12).all()
+
+
+def test_lists_hold_coordinates_only_where_others_than_balls_read_them() -> None:
+    ball, wall = hk.Sphere(0.5, (1.0, 2.0, 3.0)).formula, lambda x, y, z: x - 0.25
+    tape = record(lambda x, y, z: hk.math.minimum(ball(x, y, z), wall(x, y, z)))
+    corners = np.array([[1.0, 2.0, 3.0], [-9.0, 0.0, 0.0], [0.5, 1.0, 3.0]])
+    lists = BoxTapes.whole(tape).subset(np.zeros(3, np.int64))
+    # In the first box the ball is less, in the second one the wall, in the third one either.
+    boxes = lists.pruned(corners, corners + 0.2, BoxLimits.unlimited(3, ())).lists
+    assert boxes.lengths.tolist() == [1, 2, 4]
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -195,6 +195,17 @@ def test_cells_are_empty_where_the_clearance_says_so() -> None:
     assert (none.empty_distance == max(none.shape)).all()
 
 
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 1, 9), (5, 1, 4), (6, 7, 11)])
+def test_distances_to_occupied_cells_are_those_of_a_chessboard(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    for fraction in (0.01, 0.1, 0.9):
+        is_empty = rng.random(shape) > fraction
+        is_empty.flat[rng.integers(is_empty.size)] = False
+        cells, occupied = np.argwhere(is_empty | True), np.argwhere(~is_empty)
+        distance = np.abs(cells[:, None] - occupied).max(axis=2).min(axis=1)
+        np.testing.assert_array_equal(distance_to_occupied(is_empty), distance)
+
+
 def test_sums_over_trails_are_those_over_single_edges() -> None:
     field = broken()
     backend = choose_backend("double")

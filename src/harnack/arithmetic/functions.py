@@ -8,6 +8,7 @@ NumPy arrays, and Python numbers."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +17,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.interval import ONE, ZERO, Interval, machine_epsilon, typed_select
+from harnack.arithmetic.interval import (
+    ONE,
+    ZERO,
+    Interval,
+    machine_epsilon,
+    pad_underflow,
+    round_down,
+    round_up,
+    smallest_normal,
+    typed_select,
+)
 from harnack.backend.elementary import clamp, fmax, fmin, max_sincos_argument, sincos
 
 if TYPE_CHECKING:
@@ -88,7 +99,7 @@ def _increasing_range(f: Callable[[Any], Any], x: Interval) -> Interval:
 
 def _smallest_normal(x: Interval) -> float:
     """The smallest normal number in the precision of the interval's ends."""
-    return float(dr.smallest(cast("Any", type(x.lower))))
+    return smallest_normal(x.lower)
 
 
 def _twice(x: Interval) -> Interval:
@@ -153,13 +164,9 @@ def _log(x: Interval) -> DerivativeRanges:
     return _unbounded_unless_defined(x.lower > 0, (value, inverse, -inverse.square()))
 
 
-def _sqrt(x: Interval) -> DerivativeRanges:
-    """The ranges of the square root, of its derivative and of its second derivative on the interval
-    x.
-
-    Numbers of x below 0 have no square root: the range is that of the other numbers of x, NaN if
-    there are none. If x contains a number below 0, the ranges of the derivatives are all numbers.
-    """
+def sqrt_range(x: Interval) -> Interval:
+    """The range of the square root on the interval x. Numbers of x below 0 have no square root: the
+    range is that of the other numbers of x, NaN if there are none."""
     # The part of x with numbers >= 0.
     low = fmax(x.lower, 0)
     # A point interval keeps one object as both ends: then its root is computed once.
@@ -169,10 +176,32 @@ def _sqrt(x: Interval) -> DerivativeRanges:
     is_none = x.upper < 0
     # (The last argument of `typed_select` tells the type of the numbers only.)
     like = root.lower
-    root = Interval(
+    return Interval(
         typed_select(is_none, dr.nan, fmax(root.lower, 0), like),
         typed_select(is_none, dr.nan, root.upper, like),
     )
+
+
+def length_bound(sizes: list[Real], sign: int) -> Real:
+    """A bound of the Euclidean norm of numbers of the backend, all >= 0: a lower bound for sign -1,
+    an upper bound for sign 1. It is that end of `sqrt_range` of the sum of their squares, without
+    the operations of the other end."""
+    relative, absolute = _MAX_ULP_ERROR * machine_epsilon(sizes[0]), smallest_normal(sizes[0])
+    if sign > 0:
+        squares = [round_up(pad_underflow(size * size, 1)) for size in sizes]
+        root = dr.sqrt(functools.reduce(lambda a, b: round_up(a + b), squares))
+        return round_up(root + relative * dr.abs(root) + absolute)
+    squares = [fmax(round_down(pad_underflow(size * size, -1)), 0.0) for size in sizes]
+    root = dr.sqrt(fmax(functools.reduce(lambda a, b: round_down(a + b), squares), 0.0))
+    return fmax(round_down(root - relative * dr.abs(root) - absolute), 0.0)
+
+
+def _sqrt(x: Interval) -> DerivativeRanges:
+    """The ranges of the square root, of its derivative and of its second derivative on the interval
+    x. If x contains a number below 0, the ranges of the derivatives are all numbers."""
+    low = fmax(x.lower, 0)
+    high = low if x.lower is x.upper else x.upper
+    root = sqrt_range(x)
     # 1/(2 sqrt x) and -1/(4 x sqrt x)
     slope = _half(_positive_reciprocal(root))
     second = -_half(slope * _positive_reciprocal(Interval(low, high)))

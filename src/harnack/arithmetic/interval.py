@@ -14,6 +14,7 @@ and one piece for formulas.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -40,7 +41,7 @@ class Interval:
 
     Proof of the rounding. An operation of the backend has an error of at most half a unit in the
     last place, or less than the smallest normal number if the result is not a normal number. Each
-    end is moved outwards by a whole unit (`_round_down`, `_round_up`), which covers its own
+    end is moved outwards by a whole unit (`round_down`, `round_up`), which covers its own
     rounding and that of the move. A sum that is not a normal number is exact, or 0 on a backend
     that flushes it. In this case its error is less than the smallest normal number, which the
     tracer adds to every value.
@@ -87,7 +88,7 @@ class Interval:
         """An upper bound of the distance from `midpoint` to the numbers of the interval."""
         if self.lower is self.upper:
             return 0.0
-        return _round_up(0.5 * self.upper - 0.5 * self.lower)
+        return round_up(0.5 * self.upper - 0.5 * self.lower)
 
     @property
     def max_abs(self) -> Real:
@@ -163,8 +164,8 @@ class Interval:
         is_valid = _none_is_nan(end_products)
         if is_valid is not None:
             low, high = dr.select(is_valid, low, -dr.inf), dr.select(is_valid, high, dr.inf)
-        # `_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
-        return Interval(_round_down(_pad_underflow(low, -1)), _round_up(_pad_underflow(high, 1)))
+        # `pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
+        return Interval(round_down(pad_underflow(low, -1)), round_up(pad_underflow(high, 1)))
 
     def _times(self, constant: Interval) -> Interval:
         """The product with an interval of Python floats, whose signs are known while Dr.Jit records
@@ -174,31 +175,29 @@ class Interval:
             return self
         if a == b == -1.0:
             return -self
-        # (`_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.)
+        # (`pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.)
         # The constant may have either sign: the range is symmetric.
         if a < 0.0 < b:
-            bound = _pad_underflow(self.max_abs * max(-a, b), 1)
+            bound = pad_underflow(self.max_abs * max(-a, b), 1)
             return self._rounded_outward(-bound, bound, constant)
         if b <= 0.0:
             return -self._times(Interval(-b, -a, constant.is_single))
         if a == b <= 1.0 and np.frexp(a)[0] == 0.5:  # a power of two: exact, but for underflow
-            low, high = _pad_underflow(self.lower * a, -1), _pad_underflow(self.upper * a, 1)
+            low, high = pad_underflow(self.lower * a, -1), pad_underflow(self.upper * a, 1)
             return Interval(low, high, self.is_single or constant.is_single)
         # The constant is positive: whether a or b gives the lowest product depends on the sign of
         # `lower`.
         low = self.lower * a if a == b else _minimum(self.lower * a, self.lower * b)
         high = self.upper * b if a == b else _maximum(self.upper * a, self.upper * b)
-        return self._rounded_outward(_pad_underflow(low, -1), _pad_underflow(high, 1), constant)
+        return self._rounded_outward(pad_underflow(low, -1), pad_underflow(high, 1), constant)
 
     def square(self) -> Interval:
         """The range of x^2 for x in the interval. It is at least 0."""
         low, high = self.min_abs, self.max_abs
         if self.lower is self.upper:
             low = high
-        # `_pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
-        result = self._rounded_outward(
-            _pad_underflow(low * low, -1), _pad_underflow(high * high, 1)
-        )
+        # `pad_underflow` moves a number down (-1) or up (1) by what underflow may have cut off.
+        result = self._rounded_outward(pad_underflow(low * low, -1), pad_underflow(high * high, 1))
         return Interval(_maximum(result.lower, 0.0), result.upper, self.is_single)
 
     def reciprocal(self) -> Interval:
@@ -208,10 +207,10 @@ class Interval:
                 return Interval(-math.inf, math.inf, self.is_single)
             return self._rounded_outward(1 / self.upper, 1 / self.lower)
         has_zero = ~((self.lower > 0) | (self.upper < 0))
-        # The error of quotients is two units on CUDA. (`_pad_underflow` moves a number down (-1) or
+        # The error of quotients is two units on CUDA. (`pad_underflow` moves a number down (-1) or
         # up (1) by what underflow may have cut off.)
-        low = _round_down(_pad_underflow(1 / self.upper, -1), 4.0)
-        high = _round_up(_pad_underflow(1 / self.lower, 1), 4.0)
+        low = round_down(pad_underflow(1 / self.upper, -1), 4.0)
+        high = round_up(pad_underflow(1 / self.lower, 1), 4.0)
         return Interval(dr.select(has_zero, -dr.inf, low), dr.select(has_zero, dr.inf, high))
 
     def _rounded_outward(self, low: Real, high: Real, other: Interval | None = None) -> Interval:
@@ -222,7 +221,7 @@ class Interval:
             of single precision (`is_single`), so is the result.
         """
         single = self.is_single or (other is not None and other.is_single)
-        low, high = _round_down(low), _round_up(high)
+        low, high = round_down(low), round_up(high)
         if single and isinstance(low, float) and isinstance(high, float):
             low, high = _outward_single(low, high)
         return Interval(low, high, single)
@@ -233,8 +232,8 @@ class Interval:
         result contains the exact ends."""
         low, high = self.lower, self.upper
         return Interval(
-            _round_down(low - relative * _absolute(low) - absolute),
-            _round_up(high + relative * _absolute(high) + absolute),
+            round_down(low - relative * _absolute(low) - absolute),
+            round_up(high + relative * _absolute(high) + absolute),
         )
 
 
@@ -244,7 +243,21 @@ ONE = Interval(1.0, 1.0)
 
 def machine_epsilon(x: Real) -> float:
     """The distance from 1 to the next number, in the precision of x."""
-    return float(dr.epsilon(type(x))) * 2 if dr.is_array_v(cast("Any", type(x))) else 2.0**-52
+    return _limits_of(cast("Any", type(x)))[0]
+
+
+def smallest_normal(x: Real) -> float:
+    """The smallest normal number in the precision of x, a Dr.Jit number; 0 for a Python number."""
+    return _limits_of(cast("Any", type(x)))[1]
+
+
+@functools.cache
+def _limits_of(kind: type[Any]) -> tuple[float, float]:
+    """`machine_epsilon` and `smallest_normal` of numbers of a type. (Dr.Jit's own functions take as
+    long as recording an operation.)"""
+    if dr.is_array_v(kind):
+        return float(dr.epsilon(kind)) * 2, float(dr.smallest(kind))
+    return 2.0**-52, 0.0
 
 
 def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
@@ -256,21 +269,21 @@ def typed_select(condition: Mask, a: Real, b: Real, like: Real) -> Real:
     return dr.select(condition, kind(a) if dr.is_array_v(kind) else a, b)
 
 
-def _round_down(x: Real, units: float = 1.0) -> Real:
+def round_down(x: Real, units: float = 1.0) -> Real:
     """x minus at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), -units * machine_epsilon(x), x)
 
 
-def _round_up(x: Real, units: float = 1.0) -> Real:
+def round_up(x: Real, units: float = 1.0) -> Real:
     """x plus at least `units` units in the last place of x."""
     return dr.fma(dr.abs(x), units * machine_epsilon(x), x)
 
 
-def _pad_underflow(x: Real, sign: int) -> Real:
+def pad_underflow(x: Real, sign: int) -> Real:
     """The computed product x, moved up (sign 1) or down (-1) by the largest error that underflow
     causes. A Python float stays as it is."""
-    kind = cast("Any", type(x))
-    return x + sign * float(dr.smallest(kind)) if dr.is_array_v(kind) else x
+    smallest = smallest_normal(x)
+    return x + sign * smallest if smallest else x
 
 
 def _outward_single(low: float, high: float) -> tuple[float, float]:

@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 
 from harnack.arithmetic.angles import angle_range
-from harnack.arithmetic.functions import ElementaryFunction, exp, log, power, reciprocal, sqrt
+from harnack.arithmetic.functions import (
+    ElementaryFunction,
+    exp,
+    log,
+    power,
+    reciprocal,
+    sqrt,
+    sqrt_range,
+)
 from harnack.arithmetic.interval import ONE, ZERO, Interval, machine_epsilon, typed_select
 from harnack.arithmetic.operators import FormulaNumber, exponent_of
 from harnack.backend.elementary import fmax, fmin
@@ -347,9 +355,9 @@ class Jet(FormulaNumber):
         v, u = self.value_on_backend(number), x.value_on_backend(number)
         value, meets_cut = angle_range(v, u)
         # (The first result of `ranges` is the range of the function itself.)
-        inverse_r = sqrt.ranges(u.square() + v.square())[0]
+        inverse_r = sqrt_range(u.square() + v.square())
         # 1/r is at least 0, and x/r and y/r are within [-1, 1].
-        inverse_r = Interval(0 * inverse_r.lower, dr.inf).intersect(reciprocal.ranges(inverse_r)[0])
+        inverse_r = Interval(0 * inverse_r.lower, dr.inf).intersect(inverse_r.reciprocal())
         cosine, sine = (bound * inverse_r for bound in (u, v))
         cosine, sine = (
             Interval(fmax(bound.lower, -1), fmin(bound.upper, 1)) for bound in (cosine, sine)

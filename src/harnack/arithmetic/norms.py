@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
-from harnack.arithmetic.functions import absolute, power, reciprocal, sqrt
-from harnack.arithmetic.interval import ONE, Interval
+from harnack.arithmetic.functions import absolute, length_bound, power, sqrt_range
+from harnack.arithmetic.interval import Interval
 from harnack.arithmetic.jet import Jet, wronskian_range
 from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.elementary import fmax, fmin
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from harnack.backend import Real
 
 
 def maximum(*values: Any) -> Any:
@@ -166,14 +168,14 @@ def _jet_norm(xs: list[Jet], p: float) -> Jet:
     values = [as_backend_interval(f.value, number) for f in xs]
     length = _norm_range(values, p)
     inverse_norm = _reciprocal_norm(length)
-    ratios = [_clip_magnitude(f * inverse_norm, ONE) for f in values]
+    ratios = [_clip_magnitude(f * inverse_norm, 1.0) for f in values]
     pulls = ratios if p == 2.0 else [_signed_power(f, p - 1) for f in ratios]
     indices = range(len(xs))
     # N' is the sum of pulls times x_i', and at most the norm of the x_i'.
     first = tuple(
         _clip_magnitude(
             _total([pulls[k] * xs[k].first_derivatives[i] for k in indices]),
-            _norm_range([as_backend_interval(f.first_derivatives[i], number) for f in xs], p),
+            _slope_bound([f.first_derivatives[i] for f in xs], number, p),
         )
         for i in range(len(xs[0].first_derivatives))
     )
@@ -227,12 +229,27 @@ def _wronskian_term(
 
 def _norm_range(values: list[Interval], p: float) -> Interval:
     """The range of the p-norm of independent numbers, one in each of the intervals `values`."""
-    smallest, largest = [value.min_abs for value in values], [value.max_abs for value in values]
-    low = _norm_of_magnitudes(smallest, p).lower
+    smallest = [value.min_abs for value in values]
+    low = length_bound(smallest, -1) if p == 2.0 else _norm_of_magnitudes(smallest, p).lower
     largest_of_smallest = functools.reduce(
         fmax, smallest
     )  # rounding and underflow cannot make it shorter
-    return Interval(fmax(low, largest_of_smallest), _norm_of_magnitudes(largest, p).upper)
+    return Interval(fmax(low, largest_of_smallest), _largest_norm(values, p))
+
+
+def _largest_norm(values: list[Interval], p: float) -> Real:
+    """The upper end of `_norm_range`."""
+    largest = [value.max_abs for value in values]
+    return length_bound(largest, 1) if p == 2.0 else _norm_of_magnitudes(largest, p).upper
+
+
+def _slope_bound(slopes: list[Interval], number: Real, p: float) -> Real:
+    """An upper bound of the p-norm of derivatives. If all but one are the constant 0, as those of
+    coordinates by one of them, it is the size of that one. number: for the type of others."""
+    others = [slope for slope in slopes if not slope.is_zero]
+    if len(others) == 1 and others[0].is_literal:
+        return others[0].max_abs
+    return _largest_norm([as_backend_interval(slope, number) for slope in slopes], p)
 
 
 def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
@@ -240,9 +257,8 @@ def _norm_of_magnitudes(sizes: list[Any], p: float) -> Interval:
 
     sizes: the numbers.
     """
-    # (The first result of `ranges` is the range of the function itself.)
     if p == 2.0:
-        return sqrt.ranges(_total([Interval.point(size).square() for size in sizes]))[0]
+        return sqrt_range(_total([Interval.point(size).square() for size in sizes]))
     largest = functools.reduce(lambda a, b: dr.select((a > b) | dr.isnan(a), a, b), sizes)
     tiny = float(dr.smallest(cast("Any", type(largest))))
     # Divided by the largest, so that no power overflows.
@@ -277,16 +293,13 @@ def _reciprocal_norm(length: Interval) -> Interval:
 
     length: the range of N.
     """
-    # The range of the reciprocal itself, without those of its derivatives.
-    inverse = reciprocal.ranges(length)[0]
+    inverse = length.reciprocal()
     from_upper = Interval.point(length.upper).reciprocal()
     return Interval(fmax(from_upper.lower, 0), inverse.upper)
 
 
-def _clip_magnitude(x: Interval, limit: Interval) -> Interval:
-    """The interval x, clipped to the numbers whose absolute value is at most the upper end of
-    `limit`."""
-    bound = limit.upper
+def _clip_magnitude(x: Interval, bound: Real) -> Interval:
+    """The interval x, clipped to the numbers whose absolute value is at most `bound`."""
     return Interval(fmax(x.lower, -bound), fmin(x.upper, bound))
 
 

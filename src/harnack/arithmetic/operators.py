@@ -400,13 +400,37 @@ class OperationCounter(FormulaNumber):
         max(y, 0.01) does for x = 0.01. So the smallest |x| > 0 is kept as the tally's `finest`. An
         x that is an array counts as 1."""
         is_number = isinstance(x, int | float)
-        size = min(abs(float(x)), _MAX_SIZE) if is_number else 1.0
-        if size > 0.0:
-            self.tally.finest = min(self.tally.finest, size)
+        size = self._size_of(float(x) if is_number else 1.0)
         is_positive = is_number and x >= 0
         return OperationCounter(
             self.tally, is_constant=True, is_square=is_positive, size=size, rate=0.0
         )
+
+    def _size_of(self, x: float) -> float:
+        """The size of a constant, which is noted in the tally."""
+        size = min(abs(x), _MAX_SIZE)
+        if size > 0.0:
+            self.tally.finest = min(self.tally.finest, size)
+        return size
+
+    def __add__(self, other: Any) -> Any:
+        if isinstance(other, int | float):
+            return self._shifted(float(other), is_square=self.is_square and other >= 0)
+        return super().__add__(other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        if isinstance(other, int | float):
+            return self._shifted(float(other), is_square=False)
+        return super().__sub__(other)
+
+    def _shifted(self, x: float, *, is_square: bool) -> OperationCounter:
+        """The sum of this number and the constant x or -x, as of two numbers."""
+        size = self._size_of(x)
+        farthest = max(size, self.size) if self.is_constant else size
+        self.tally.farthest = max(self.tally.farthest, farthest)
+        return self._after(_SUM, self, self.size + size, self.rate, is_square=is_square)
 
     def sum(self, other: OperationCounter) -> OperationCounter:
         """The sum of this number and another one. The largest absolute value of a constant that is

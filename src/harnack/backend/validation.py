@@ -326,6 +326,8 @@ def as_real(value: Any, name: str) -> float:
     Raises:
         TypeError: it is not a number.
     """
+    if type(value) is float:  # the most frequent type
+        return value
     try:
         # float("none") raises ValueError, so texts and bools are refused.
         return float("none" if isinstance(value, str | bytes | bool | np.bool_) else value)

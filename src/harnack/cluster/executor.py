@@ -15,7 +15,6 @@ worker's memory, because such data would be lost with the worker.
 
 from __future__ import annotations
 
-import asyncio
 import os
 import time
 import warnings
@@ -293,6 +292,8 @@ class _DaskTasks:
             RuntimeError: several workers were lost while they ran the task, or the scheduler is
                 gone.
         """
+        from asyncio import CancelledError  # imported here: it takes time that few programs need
+
         self._wait()
         future = next(self.completed)
         try:
@@ -302,7 +303,7 @@ class _DaskTasks:
                 f"several workers were lost while they did one part ({error}): it may need more "
                 "memory than they have. Divide the task into more parts (chunks), or give them more"
             ) from None
-        except (asyncio.CancelledError, self.scheduler_lost):
+        except (CancelledError, self.scheduler_lost):
             raise RuntimeError(SCHEDULER_LOST) from None
         name = self.names.pop(future)
         future.release()
@@ -334,11 +335,13 @@ class _DaskTasks:
     def cancel(self) -> list[tuple[str, TaskResult]]:
         """Cancel unfinished tasks, and return (name, result) of the tasks that are finished but
         whose results were not fetched."""
+        from asyncio import CancelledError  # imported here: it takes time that few programs need
+
         finished = [future for future in self.names if future.status == "finished"]
         results: list[tuple[str, TaskResult]] = []
         # Without a scheduler there are no results to fetch; the error that is raised says so.
         # (`_run_task` returns the arrays first.)
-        with suppress(OSError, TimeoutError, asyncio.CancelledError, self.scheduler_lost):
+        with suppress(OSError, TimeoutError, CancelledError, self.scheduler_lost):
             self.client.cancel([future for future in self.names if future.status != "finished"])
             for future in finished:
                 results.append((self.names[future], future.result(timeout=_NO_WORKER_SECONDS)[0]))

@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
+import importlib
 import io
 import os
 import pickle
@@ -84,6 +84,8 @@ def import_cluster_package(name: str, feature: str) -> Any:
 def package_versions() -> str:
     """Return the versions, as one text, of this library and of the libraries on which the bits of
     its results depend."""
+    import importlib.metadata  # imported here, as it takes time that few programs need
+
     versions = (f"{name} {importlib.metadata.version(name)}" for name in _PACKAGES)
     return ", ".join((f"harnack {__version__}", *versions))
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dis
 import functools
 import importlib.machinery
-import importlib.metadata
 import importlib.util
 import sys
 import sysconfig
@@ -276,6 +275,8 @@ def installed_version(root: str) -> str | None:
     package has it, as for Python's own modules and users' modules."""
     if root in sys.stdlib_module_names or root in ("__main__", "harnack") or _is_user_root(root):
         return None
+    import importlib.metadata  # imported here, as it takes time that few programs need
+
     with suppress(importlib.metadata.PackageNotFoundError, ValueError):
         return importlib.metadata.version(root)
     for name in importlib.metadata.packages_distributions().get(root, ()):

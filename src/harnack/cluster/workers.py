@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.metadata
 import sys
 import warnings
 from collections.abc import Generator, Iterable
@@ -118,6 +117,8 @@ def _check_workers(client: Any) -> None:
     Raises:
         RuntimeError: a worker has other versions, or cannot compute.
     """
+    import importlib.metadata  # imported here, as it takes time that few programs need
+
     # A function of the standard library, which every worker has. In place of the result of a worker
     # that fails stands its error.
     versions = client.run(importlib.metadata.version, "harnack", on_error="return")

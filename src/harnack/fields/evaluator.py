@@ -21,7 +21,7 @@ from harnack.enclosures.samples import validate_samples
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harnack.backend import Real, Vec3
+    from harnack.backend import Mask, Real, Vec3
     from harnack.enclosures.samples import Ray, RaySample, Sample
     from harnack.fields.capabilities import Jumps, ModuloOne, Patches, VariableAccuracy
     from harnack.tree.empty_space import OccupancyGrid
@@ -91,6 +91,12 @@ class Evaluator(abc.ABC):
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p. It is called while a loop is being recorded. So use `drjit` functions
         of p, and no Python branches on its values."""
+
+    def evaluate_where(self, p: Vec3, active: Mask) -> Sample:
+        """The sample at p on active lanes, and anything on others. The default evaluates f on all
+        lanes. An evaluator to which some points cost far more than others overrides this."""
+        del active
+        return self.evaluate(p)
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, and enclosures: intervals that are

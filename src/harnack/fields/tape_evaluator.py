@@ -313,6 +313,11 @@ class TapeEvaluator(FormulaEvaluator):
     def evaluate(self, p: Vec3) -> Sample:
         return self._at(p).evaluate(p)
 
+    def evaluate_where(self, p: Vec3, active: Mask) -> Sample:
+        """The sample at p on active lanes, and NaN on others, where no list is run. (Outside of the
+        cells it would be the whole one.)"""
+        return self.evaluate(dr.select(active, p, dr.nan))
+
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return self._at(p).hessian(p)
 

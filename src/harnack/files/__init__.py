@@ -1,31 +1,10 @@
-"""Readers of curves, meshes, clouds, blobs and molecules, and atomic writing of files."""
+"""Readers of curves, meshes, clouds, blobs and molecules, and atomic writing of files. The names
+that `__init__.pyi` lists are imported when they are first used."""
 
 from __future__ import annotations
 
-from harnack.files import outline as outline
-from harnack.files.file_geometry import FileFormatError, write_atomically
-from harnack.files.geometry_files import (
-    LoadedCloud,
-    LoadedCurves,
-    LoadedMesh,
-    LoadedPolygons,
-    read_geometry,
-    read_loops,
-)
-from harnack.files.molecules import Atoms, read_molecule
-from harnack.files.text_formats import Metaballs
+from typing import Any, cast
 
-__all__ = [
-    "Atoms",
-    "FileFormatError",
-    "LoadedCloud",
-    "LoadedCurves",
-    "LoadedMesh",
-    "LoadedPolygons",
-    "Metaballs",
-    "outline",
-    "read_geometry",
-    "read_loops",
-    "read_molecule",
-    "write_atomically",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)

@@ -13,6 +13,7 @@ grid.
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -135,7 +136,7 @@ def as_point(value: Iterable[float], name: str, *, finite: bool = True) -> Point
         raise ValueError(f"{name} must be three numbers, not {value!r}") from None
     if len(numbers) != 3:
         raise ValueError(f"{name} must be three numbers, not {numbers}")
-    if any(np.isnan(numbers)) or (finite and not all(np.isfinite(numbers))):
+    if any(map(math.isnan, numbers)) or (finite and not all(map(math.isfinite, numbers))):
         raise ValueError(f"{name} must be finite, not {numbers}")
     return numbers
 

@@ -1,18 +1,10 @@
-"""Triangle meshes of level sets."""
+"""Triangle meshes of level sets. The names that `__init__.pyi` lists are imported when they are
+first used."""
 
-from harnack.meshing.mesh_pipeline import mesh
-from harnack.meshing.meshing_errors import MeshingError
-from harnack.meshing.print_checks import PrintCheck, PrintProblem, check_print
-from harnack.meshing.repair_stages import repair
-from harnack.meshing.thickness import WallThickness, wall_thickness
+from __future__ import annotations
 
-__all__ = [
-    "MeshingError",
-    "PrintCheck",
-    "PrintProblem",
-    "WallThickness",
-    "check_print",
-    "mesh",
-    "repair",
-    "wall_thickness",
-]
+from typing import Any, cast
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)

@@ -1,28 +1,11 @@
 """Renders pictures of surfaces, which are level sets of fields: inside Mitsuba scenes, or in a
-studio that sets up lights, ground and camera by itself."""
+studio that sets up lights, ground and camera by itself. The names that `__init__.pyi` lists are
+imported when they are first used."""
 
 from __future__ import annotations
 
-from harnack.rendering.animation import animate
-from harnack.rendering.camera import Camera
-from harnack.rendering.framing import UnboundedSurfaceError
-from harnack.rendering.images import Picture
-from harnack.rendering.isolines import Isolines
-from harnack.rendering.mitsuba_plugins import mitsuba_shape, register
-from harnack.rendering.picture import render
-from harnack.rendering.render_options import SHOW_MODES
-from harnack.rendering.stage import MATERIALS, Material
+from typing import Any, cast
 
-__all__ = [
-    "MATERIALS",
-    "SHOW_MODES",
-    "Camera",
-    "Isolines",
-    "Material",
-    "Picture",
-    "UnboundedSurfaceError",
-    "animate",
-    "mitsuba_shape",
-    "register",
-    "render",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = cast("Any", lazy_loader).attach_stub(__name__, __file__)

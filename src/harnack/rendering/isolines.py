@@ -36,7 +36,6 @@ from harnack.backend import upload_floats
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.validation import as_positive
 from harnack.fields import Field
-from harnack.fields.expressions import expression
 from harnack.rendering.scales import Color, parse_color
 
 if TYPE_CHECKING:
@@ -60,6 +59,8 @@ def as_field(function: Any, name: str = "color_by") -> Field:
         TypeError, ValueError: another argument, or a field that has a function of its own for each
             part of space.
     """
+    from harnack.fields.expressions import expression  # imported here: few pictures need it
+
     if isinstance(function, str):
         try:
             return expression(function)

@@ -11,6 +11,7 @@ shortened.
 from __future__ import annotations
 
 import codecs
+import functools
 import importlib
 import os
 import re
@@ -22,9 +23,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import Backend, backend_of, choose_backend
-from harnack.fields.expressions import looks_like_formula
 from harnack.files.file_geometry import MAX_BYTES, FileLocation, read_bytes
-from harnack.files.geometry_files import GEOMETRY_SUFFIXES
 
 _USABLE = re.compile(r"(llvm|cuda|metal)_ad_(mono|rgb|spectral)(_double)?")
 
@@ -49,7 +48,7 @@ def load_mitsuba() -> Any:
                 f"this Mitsuba has no variant {variant}: set HARNACK_BACKEND=llvm to draw on the "
                 "CPU"
             )
-        mi.set_variant(variant)
+        _set_variant(mi, variant)
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
@@ -68,7 +67,39 @@ def set_variant(variant: str) -> None:
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() != variant:
+        _set_variant(mi, variant)
+
+
+def _set_variant(mi: Any, variant: str) -> None:
+    """Set a Mitsuba variant. Mitsuba's own integrators, of which most pictures need none, are
+    written with the decorator `drjit.syntax`, which parses and compiles them anew as soon as they
+    are imported. Here it does so when they are first called: setting the first variant takes half
+    the time."""
+    package: Any = dr
+    syntax: Any = package.syntax
+
+    def on_first_call(function: Any = None, **settings: Any) -> Any:
+        """The decorator `drjit.syntax`, which does its work when the function is first called."""
+        if function is None:
+            return functools.partial(on_first_call, **settings)
+
+        @functools.cache
+        def transformed() -> Any:
+            """The function that the decorator makes."""
+            return syntax(function, **settings)
+
+        @functools.wraps(function)
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            """Call this function."""
+            return transformed()(*arguments, **keywords)
+
+        return call
+
+    package.syntax = on_first_call
+    try:
         mi.set_variant(variant)
+    finally:
+        package.syntax = syntax
 
 
 def mitsuba_backend(mi: Any) -> Backend:
@@ -130,6 +161,10 @@ def check_scene_file(path: Path) -> None:
         FileFormatError: a file is of another kind or too large. If the path names a surface file, a
             formula or no file at all, the message says what to do instead.
     """
+    # Imported here: only scene files need them.
+    from harnack.fields.expressions import looks_like_formula
+    from harnack.files.geometry_files import GEOMETRY_SUFFIXES
+
     if path.suffix.lower() in GEOMETRY_SUFFIXES:
         raise FileLocation(path).error(
             "this is a surface file, not a Mitsuba scene (.xml): draw its field, "

@@ -42,10 +42,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from harnack.fields import Field
-from harnack.fields.analytic.periodic import Gyroid, SchwarzD, SchwarzP
-from harnack.fields.analytic.polynomial import SphericalHarmonic
-from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.files import read_loops
 from harnack.geometry import Ball, Box, VolumeIntersection
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering import integrator, mitsuba_proxy
@@ -176,9 +172,6 @@ def _kind(integrator: Any) -> str:
     return moment_class if kind == "Scene" else kind
 
 
-_PERIODIC = {"gyroid": Gyroid, "schwarz_p": SchwarzP, "schwarz_d": SchwarzD}
-
-
 def register() -> Any:
     """Register the shape `harnack` and the integrator `harnack_path` with Mitsuba, and return the
     module `mitsuba`.
@@ -233,18 +226,23 @@ def _field(props: Any) -> Field:
     Raises:
         ValueError: unknown names, or not exactly one of file and field.
     """
+    # Imported here: they take time, and only scenes of Mitsuba's need them.
+    from harnack.fields import Gyroid, SchwarzD, SchwarzP, SolidAngle, SphericalHarmonic
+    from harnack.files import read_loops
+
     if ("file" in props) == ("field" in props):
         raise ValueError("a harnack shape needs either a file of curves or a field")
     if "file" in props:
         path = load_mitsuba().file_resolver().resolve(props["file"])
         return SolidAngle(read_loops(str(path), boundary=props.get("boundary", False)))
     name = props["field"]
-    if name in _PERIODIC:
+    periodic = {"gyroid": Gyroid, "schwarz_p": SchwarzP, "schwarz_d": SchwarzD}
+    if name in periodic:
         # The clip takes the place of the field's own domain.
-        return _PERIODIC[name](props.get("cell", 2 * math.pi), domain=_clip(props))
+        return periodic[name](props.get("cell", 2 * math.pi), domain=_clip(props))
     if name == "spherical_harmonic":
         return SphericalHarmonic(props["l"], props["m"])
-    known = (*_PERIODIC, "spherical_harmonic")
+    known = (*periodic, "spherical_harmonic")
     raise ValueError(
         f"unknown field {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}"
     )

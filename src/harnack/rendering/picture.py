@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 
 from harnack.cluster.executor import Executor, open_executor
 from harnack.fields import Field
@@ -253,6 +252,8 @@ def _with_time_estimate(
         features=task.features,
     )  # fmt: skip
     if progress is True and estimate.picture > MIN_REPORTED_SECONDS:
+        from rich.console import Console  # imported here: it takes time that few pictures need
+
         Console(stderr=True, highlight=False).print(
             f"this picture will take about {estimate}, with {task.spp} samples a pixel"
         )

@@ -14,11 +14,6 @@ import numpy as np
 
 from harnack.fields import Field, Solid
 from harnack.fields.field import suggest_field
-from harnack.fields.solid_angles.winding_number import WindingNumber
-from harnack.fields.solids.tube import Tube
-from harnack.geometry.meshes import MeshError, without_zero_area_faces
-from harnack.meshing import mesh
-from harnack.meshing.meshing_errors import MeshingError
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.option_table import names_of
 from harnack.rendering.stage import Material, StudioObject, parse_material
@@ -153,6 +148,11 @@ def _thickened(surface: TracedSurface, thickness: float) -> TracedSurface:
     Raises:
         ValueError: there is no such mesh.
     """
+    # Imported here: few pictures need them, and they take a tenth of a second.
+    from harnack.fields.solid_angles.winding_number import WindingNumber
+    from harnack.geometry.meshes import MeshError, without_zero_area_faces
+    from harnack.meshing import MeshingError, mesh
+
     if surface.solid_range is not None or len(surface.levels) != 1:
         raise ValueError("thickness needs a surface of one level; a solid has an inside already")
     if surface.largest:
@@ -244,6 +244,8 @@ def _boundary_tubes(
     Raises:
         ValueError: the radius is no positive number, or no surface ends at a curve.
     """
+    from harnack.fields.solids.tube import Tube  # imported here: few pictures need it
+
     if isinstance(radius, bool) or not isinstance(radius, Real) or not 0 < float(radius) < math.inf:
         raise ValueError(f"boundary_radius is a length, such as 0.03, not {radius!r}")
     tubes: list[StudioObject] = []

@@ -158,17 +158,19 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
     side = dr.select(value_to_level > 0, tracer.backend.Float(1), -1)
     if trace.side is not None:  # hits at crossings are at a root
         newton_step, side = dr.zeros(type(newton_step)), trace.side
-    # Rays without a hit may have t = inf: they are evaluated at their origin.
+    # Rays without a hit may have t = inf: they keep their origin.
     t = dr.maximum(dr.select(is_hit, trace.t, 0) + newton_step, 0)
     position = dr.fma(vector(t), d, o)
     if has_jumps:
         sample = _sample_where(tracer, position, trace.value, d, is_smooth)
     else:
-        sample = tracer.sample(position)
+        sample = tracer.sample_where(position, is_hit)
     gradient_norm = norm(sample.gradient)
     normal = dr.select(gradient_norm > 0, sample.gradient / gradient_norm, -d)
     # A field may have another normal for shading than its gradient.
     shading_normal = normal if sample.shading_normal is None else sample.shading_normal
+    shading_normal = dr.select(is_hit, shading_normal, -d)
+    value = dr.select(is_hit, sample.value, trace.value)
     uncertainty = _uncertainty(tracer, sample.gradient, t, sample.value, sample.value_error)
     # Second movement: along the gradient, by the distance to the level to first order.
     correction = tracer.levels.offset_to_nearest(sample.value) / gradient_norm
@@ -186,7 +188,7 @@ def _refine_hits(tracer: SurfaceTracer, rays: _MarchedRays) -> SurfaceHit:
         position=dr.fma(vector(correction), normal, position),
         normal=orient_normal(shading_normal, d, side),
         ray_offset=RAY_OFFSET * uncertainty,
-        value=sample.value,
+        value=value,
         evaluations=trace.evaluations + dr.select(is_smooth, tracer.backend.UInt32(1), 0),
         is_hole_filling=is_smooth & has_jumps,
         is_on_section=tracer.backend.Bool(False),
@@ -332,9 +334,10 @@ class CappedSolid:
         low, high = (next(finite) if math.isfinite(end) else end for end in surface.solid_range)
         return cls(tracer, low, high)
 
-    def _contains(self, p: Vec3) -> Mask:
-        """Return the mask of points p (3,) of the volume that belong to the solid."""
-        value = self.tracer.sample(p).value
+    def _contains(self, p: Vec3, active: Mask) -> Mask:
+        """Return the mask of points p (3,) of the volume that belong to the solid; anything on
+        lanes that are not active."""
+        value = self.tracer.sample_where(p, active).value
         # `level_counts` leaves out other components if only the largest one is drawn.
         return (value >= self.low) & (value <= self.high) & self.tracer.level_counts(p)
 
@@ -361,9 +364,8 @@ class CappedSolid:
         # which points belong to it. Such rays are not resolved, and run out of steps in
         # `_meet_levels`.
         is_resolved = self.tracer.is_resolved(o, t_leave)
-        starts_inside = (
-            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
-        )
+        is_known = meets_volume & is_resolved
+        starts_inside = is_known & self._contains(self._point_on_ray(o, d, t_enter), is_known)
         origin_is_inside = starts_inside & (t_enter <= 0)
         # The ray should start inside (side < 0) or outside (side > 0), and does not.
         is_on_wrong_side = (
@@ -434,9 +436,8 @@ class CappedSolid:
         # Rays for which rounding leaves in doubt what belongs to the solid are not resolved;
         # `occluded` counts them as hits.
         is_resolved = self.tracer.is_resolved(o, t_leave)
-        starts_inside = (
-            meets_volume & is_resolved & self._contains(self._point_on_ray(o, d, t_enter))
-        )
+        is_known = meets_volume & is_resolved
+        starts_inside = is_known & self._contains(self._point_on_ray(o, d, t_enter), is_known)
         hits_cap = starts_inside & ((t_enter > 0) | (t_leave < t_max))
         # All other rays are tested from t = 0 to t_max.
         return hits_cap | self.tracer.occluded(o, d, 0, t_max, active & ~hits_cap)

@@ -98,7 +98,8 @@ class BoxTapes:
     starts: (m + 1,) the list of box k has the entries starts[k] to starts[k + 1] - 1.
     instructions: (n,) for each entry the instruction of the tape.
     operands: (3, n) for each entry the entries that are its operands; the entry itself in place of
-        operands that its operation does not have.
+        operands that its operation does not have. Operations of the point itself
+        (`Operation.is_of_point`) have none: coordinates are in a list only where others use them.
     """
 
     tape: Tape
@@ -112,7 +113,8 @@ class BoxTapes:
         count = tape.result + 1
         instructions = np.arange(count, dtype=np.int32)
         operands = tape.operands[:count].T.astype(np.int32)
-        operands = np.where(operands >= 0, operands, instructions)
+        is_known = (operands >= 0) & ~tape.is_of_point[:count]
+        operands = np.where(is_known, operands, instructions)
         return cls(tape, np.array([0, count], np.int64), instructions, operands)
 
     def __len__(self) -> int:
@@ -173,7 +175,8 @@ class BoxTapes:
     def _operand_columns(self, kind: int, group: EntryArray) -> list[EntryArray]:
         """The operands (k,) of the entries of a group: an array for each operand of the
         operation."""
-        count = self.tape.operations[kind].operand_count
+        operation = self.tape.operations[kind]
+        count = 0 if operation.is_of_point else operation.operand_count
         return [column[group] for column in self.operands[:count]]
 
     def _constant_columns(self, kind: int, group: EntryArray) -> list[FloatArray]:
@@ -210,14 +213,19 @@ class BoxTapes:
         """The ranges of all entries on their boxes: their lower and upper ends (n,)."""
         count = len(self.instructions)
         low, high = np.empty(count), np.empty(count)
+        lower_columns, upper_columns = np.ascontiguousarray(lower.T), np.ascontiguousarray(upper.T)
         for kind, group in self._groups:
             if kind < 0:
                 axes, boxes = self.instructions[group], self.boxes[group]
                 low[group], high[group] = lower[boxes, axes], upper[boxes, axes]
                 continue
-            ranges = [(low[column], high[column]) for column in self._operand_columns(kind, group)]
-            constants = self._constant_columns(kind, group)
             operation = self.tape.operations[kind]
+            ranges = [(low[column], high[column]) for column in self._operand_columns(kind, group)]
+            if operation.is_of_point:
+                boxes = self.boxes[group]
+                columns = zip(lower_columns, upper_columns, strict=True)
+                ranges = [(start[boxes], end[boxes]) for start, end in columns]
+            constants = self._constant_columns(kind, group)
             low[group], high[group] = operation.rounded_ranges(ranges, constants)
         return low, high
 

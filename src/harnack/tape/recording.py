@@ -16,7 +16,7 @@ import numpy as np
 
 from harnack.arithmetic.functions import exp, log, power, reciprocal, sqrt
 from harnack.arithmetic.operators import FormulaNumber, exponent_of
-from harnack.backend import FloatArray, IntArray
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.tape.operations import (
     COORDINATE_COUNT,
     Operation,
@@ -69,6 +69,12 @@ class Tape:
     def constant_columns(self) -> FloatArray:
         """The constants as an array (c, n)."""
         return np.ascontiguousarray(self.constants.T)
+
+    @functools.cached_property
+    def is_of_point(self) -> BoolArray:
+        """For each instruction (n,) whether its operands are always the coordinates."""
+        kinds_of_point = [operation.is_of_point for operation in self.operations]
+        return np.array([*kinds_of_point, False])[self.kinds]  # coordinates have the kind -1
 
     @functools.cached_property
     def depths(self) -> IntArray:
@@ -222,6 +228,16 @@ class TapeNumber(FormulaNumber):
     def recorded(self) -> TapeNumber:
         """This number as the result of an instruction."""
         return self._of_instruction(self.index)
+
+    def __add__(self, other: Any) -> Any:
+        if isinstance(other, int | float) and _is_exact_sum(self.shift, float(other)):
+            return TapeNumber(self.recorder, self.terms, self.shift + float(other))
+        return super().__add__(other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Any) -> Any:
+        return self + -other if isinstance(other, int | float) else super().__sub__(other)
 
     def sum(self, other: TapeNumber) -> TapeNumber:
         """The sum of this number and another one."""

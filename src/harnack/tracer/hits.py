@@ -31,7 +31,6 @@ from harnack.tracer.level_contact import HitTolerance, RayStatus
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
 from harnack.tracer.traced_surface import TracedSurface
-from harnack.webgpu import evaluate_on_device, find_device
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -420,6 +419,8 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
 
     Raises RuntimeError if the device's hits of a sample of the rays differ from those of Dr.Jit.
     """
+    from harnack.webgpu import evaluate_on_device, find_device  # imported here: few need it
+
     count = rays.count
     tracer = surface.tracer(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
     # A device needs every array at full width: single numbers are repeated for each ray.

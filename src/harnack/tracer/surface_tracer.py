@@ -20,6 +20,7 @@ from harnack.backend.elementary import fmax, fmin, max_norm
 from harnack.backend.loops import loop_with_queue
 from harnack.enclosures.samples import Ray
 from harnack.fields.capabilities import NO_FACET, NO_PATCH
+from harnack.fields.formula_evaluator import without_alternatives
 from harnack.tracer.branch_tracker import BranchTracker
 from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (
@@ -304,6 +305,12 @@ class SurfaceTracer:
     def sample(self, p: Vec3) -> Sample:
         """Return the sample of f (value, gradient, error bounds) at points p (3,)."""
         return self.evaluator.evaluate(p)
+
+    def sample_where(self, p: Vec3, active: Mask) -> Sample:
+        """Return the sample of f at points p (3,) on active lanes, and anything on others. It is
+        without the alternative promises of formulas."""
+        with without_alternatives():
+            return self.evaluator.evaluate_where(p, active)
 
     def sample_with_branch(self, p: Vec3, value: Real) -> Sample:
         """Return the sample of f at p, with the integer added that is unknown if samples give f

@@ -396,12 +396,31 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
 
     empty: (nz, ny, nx) a mask of the empty cells.
     """
-    if empty.all():
-        return np.full(empty.size, max(empty.shape), np.int64)
-    from scipy import ndimage  # imported here: it takes a third of a second
+    # (SciPy has this transform, but importing `scipy.ndimage` takes a fifth of a second.)
+    distance = np.where(empty, max(empty.shape), 0).astype(np.int32)
+    # A way of least length goes along x first, then diagonally in x and y or along y, then in all
+    # of x, y and z. So sweeps along x, along y and along z find all distances.
+    for axis in (2, 1, 0):
+        planes = np.moveaxis(distance, axis, 0)
+        count, swept = len(planes), (axis == 0, axis <= 1)
+        for step, order in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
+            for k in order:
+                before = _least_of_three(planes[k + step], swept)
+                np.minimum(planes[k], before + 1, out=planes[k])
+    return distance.astype(np.int64).ravel()
 
-    chessboard: Any = cast("Any", ndimage).distance_transform_cdt  # its default metric
-    return np.asarray(chessboard(empty), dtype=np.int64).ravel()
+
+def _least_of_three(plane: IntArray, along: tuple[bool, bool]) -> IntArray:
+    """For each entry of a plane the least of it and its neighbors along the axes in `along`, and
+    along both also diagonally."""
+    for axis in (0, 1):
+        if along[axis]:
+            entries, least = np.moveaxis(plane, axis, 0), plane.copy()
+            rows = np.moveaxis(least, axis, 0)
+            np.minimum(rows[1:], entries[:-1], out=rows[1:])
+            np.minimum(rows[:-1], entries[1:], out=rows[:-1])
+            plane = least
+    return plane
 
 
 def round_to_short_float(size: float) -> float:
