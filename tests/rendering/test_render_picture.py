@@ -358,22 +358,6 @@ print(sorted({"asyncio", "rich", "scipy", *parts} & set(sys.modules)))
     assert in_a_new_process(code) == "[]"
 
 
-@pytest.mark.slow
-def test_integrators_of_mitsuba_work_though_they_are_made_when_they_are_called() -> None:
-    code = """
-import harnack as hk, drjit as dr
-syntax = dr.syntax
-mi = hk.rendering.register()
-assert dr.syntax is syntax
-scene = {"type": "scene", "ball": {"type": "sphere"}, "light": {"type": "constant"}}
-scene["sensor"] = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(
-    [0, -5, 0], [0, 0, 0], [0, 0, 1]), "film": {"type": "hdrfilm", "width": 4, "height": 4}}
-image = mi.render(mi.load_dict(scene), integrator=mi.load_dict({"type": "prb"}), spp=16)
-print(0.4 < dr.mean(image, axis=None) < 1.0)
-"""
-    assert in_a_new_process(code) == "True"
-
-
 DRAW = """
 import harnack as hk, mitsuba as mi
 from harnack.rendering import render

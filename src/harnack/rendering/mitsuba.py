@@ -11,7 +11,6 @@ shortened.
 from __future__ import annotations
 
 import codecs
-import functools
 import importlib
 import os
 import re
@@ -48,7 +47,7 @@ def load_mitsuba() -> Any:
                 f"this Mitsuba has no variant {variant}: set HARNACK_BACKEND=llvm to draw on the "
                 "CPU"
             )
-        _set_variant(mi, variant)
+        mi.set_variant(variant)
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
@@ -67,39 +66,7 @@ def set_variant(variant: str) -> None:
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() != variant:
-        _set_variant(mi, variant)
-
-
-def _set_variant(mi: Any, variant: str) -> None:
-    """Set a Mitsuba variant. Mitsuba's own integrators, of which most pictures need none, are
-    written with the decorator `drjit.syntax`, which parses and compiles them anew as soon as they
-    are imported. Here it does so when they are first called: setting the first variant takes half
-    the time."""
-    package: Any = dr
-    syntax: Any = package.syntax
-
-    def on_first_call(function: Any = None, **settings: Any) -> Any:
-        """The decorator `drjit.syntax`, which does its work when the function is first called."""
-        if function is None:
-            return functools.partial(on_first_call, **settings)
-
-        @functools.cache
-        def transformed() -> Any:
-            """The function that the decorator makes."""
-            return syntax(function, **settings)
-
-        @functools.wraps(function)
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            """Call this function."""
-            return transformed()(*arguments, **keywords)
-
-        return call
-
-    package.syntax = on_first_call
-    try:
         mi.set_variant(variant)
-    finally:
-        package.syntax = syntax
 
 
 def mitsuba_backend(mi: Any) -> Backend:
