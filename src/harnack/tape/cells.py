@@ -142,7 +142,11 @@ class _Octree:
         """
         batches = _batches(lists.lengths)
         results = [self._pruned(lists, indices, limits, rest, cells) for cells in batches]
-        is_divided = [~self._is_empty(part) & (rest > 0) for part in results]
+        # A list of one instruction is not made shorter, so that only fewer empty cells would be
+        # told apart: for that the smallest cells cost too much.
+        is_divided = [
+            ~self._is_empty(part) & (rest > (part.lists.lengths <= 1)) for part in results
+        ]
         octant_count = 8 * sum(int(divided.sum()) for divided in is_divided)
         entry_count = sum(
             8 * int(part.lists.lengths[divided].sum())
