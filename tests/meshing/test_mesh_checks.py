@@ -186,8 +186,7 @@ def test_simplified_meshes_have_no_more_triangles_than_without(
     assert fewer.is_watertight
     facts = fewer.metadata["harnack"]
     assert facts["triangles_before_simplification"] == len(plain.faces)
-    most = len(plain.faces) if surface.side == "between" else 0.8 * len(plain.faces)
-    assert len(fewer.faces) <= most
+    assert len(fewer.faces) <= len(plain.faces)
     assert fewer.volume == pytest.approx(plain.volume, rel=2e-2)
 
 
@@ -251,7 +250,7 @@ def test_cells_are_as_small_as_a_lattice_needs(
 ):
     """A 24th of these parts is a third of a cell or half of it, where walls are missed, or found
     in pieces, the wrong volume and all."""
-    mesh = hk.mesh(part, tolerance=(2e-3 if bodies else 4e-3) * longest_side(part))
+    mesh = hk.mesh(part, tolerance=(1.5e-3 if bodies else 4e-3) * longest_side(part))
     assert mesh.is_watertight
     assert mesh.metadata["harnack"]["spacing"] < part.traits.min_wavelength / 4.999
     assert mesh.volume == pytest.approx(

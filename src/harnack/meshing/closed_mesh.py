@@ -32,6 +32,7 @@ __all__ = [
     "from_manifold",
     "grown",
     "mesh_manifold",
+    "polygon_factor",
     "revolved_manifold",
     "to_manifold",
     "volume_manifold",
@@ -161,11 +162,18 @@ def box_manifold(lower: FloatArray, upper: FloatArray) -> Manifold:
     return Manifold.cube((x, y, z)).translate((a, b, c))
 
 
+def polygon_factor(around: int) -> float:
+    """The radius of the circle through the corners of a regular polygon that has the area of the
+    unit circle."""
+    angle = 2 * math.pi / around
+    return math.sqrt(angle / math.sin(angle))
+
+
 def cylinder_manifold(cylinder: Cylinder, level: float, tolerance: float) -> Manifold | None:
     """The points where the function of a cylinder is at most `level`, as a manifold3d solid. None
     if the level is positive, since the edges of a cylinder that grows are round, or if it has no
-    ends. Vertices lie on the surface; faces are within `tolerance` (a length) of it, since chords
-    of n points around are radius (1 - cos(pi/n)) deep, at most radius (pi/n)^2/2."""
+    ends. Cross sections have the right area; corners are outside of the surface, and the middles of
+    edges inside, by less than `tolerance` (a length)."""
     from manifold3d import Manifold
 
     if level > 0 or cylinder.height is None:
@@ -173,8 +181,16 @@ def cylinder_manifold(cylinder: Cylinder, level: float, tolerance: float) -> Man
     radius, height = cylinder.radius + level, cylinder.height + 2 * level
     if radius <= 0 or height <= 0:
         return Manifold()
-    around = max(8, math.ceil(math.pi * math.sqrt(0.5 * radius / tolerance)))
-    return Manifold.cylinder(height, radius, circular_segments=around, center=True)
+    # Corners are about radius (2 pi/n)^2/12 outside, and edges half as much inside.
+    around = max(8, math.ceil(2 * math.pi * math.sqrt(radius / (12 * tolerance))))
+    while (polygon_factor(around) - 1) * radius > tolerance:
+        around += 1
+    if around > _MAX_SEGMENTS:
+        raise MeshingError(
+            f"a cylinder within {tolerance:.3g} has {around:,} faces: choose a larger `tolerance`"
+        )
+    corner = radius * polygon_factor(around)
+    return Manifold.cylinder(height, corner, circular_segments=around, center=True)
 
 
 def extruded_manifold(

@@ -15,7 +15,7 @@ import numpy as np
 
 from harnack.geometry.mesh_edges import row_norms
 from harnack.geometry.neighborhoods import kd_tree
-from harnack.meshing.closed_mesh import from_manifold, to_manifold
+from harnack.meshing.closed_mesh import from_manifold, polygon_factor, to_manifold
 from harnack.meshing.meshing_errors import MeshingError
 from harnack.meshing.triangle_mesh import TriangleMesh
 
@@ -202,8 +202,7 @@ def _resolution(depth: float, ratio: float) -> tuple[int, float, float]:
     around = max(_LEAST_AROUND, int(2 * math.pi / math.sqrt(12 * depth)) - 1)
     while True:
         angle = 2 * math.pi / around
-        # A regular polygon with this circumradius has the area of the unit circle.
-        factor = math.sqrt(angle / math.sin(angle))
+        factor = polygon_factor(around)
         square = 8 * (depth + (factor - 1) * ratio) / factor - angle * angle
         if factor - 1 <= depth and square >= depth:
             return around, math.sqrt(square), factor
