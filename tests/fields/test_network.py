@@ -15,7 +15,6 @@ import harnack as hk
 from harnack.backend import choose_backend, to_numpy, to_vector3
 from harnack.backend.local_memory import allocate_local
 from harnack.testing import check_field
-from harnack.webgpu import UntranslatableError
 from tests.oracles.networks import first_hits, network_value_and_gradient
 
 ACTIVATIONS: dict[str, Any] = {
@@ -210,12 +209,6 @@ def test_solids_and_distances() -> None:
     assert hits.t[0] == pytest.approx(0.3, abs=1e-3)
     distance = hk.signed_distance(network, [[0.0, 0.0, 0.0]])[0]
     assert distance == pytest.approx(-0.9 / np.sqrt(3), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_pages_say_what_they_cannot_show(tmp_path: Path) -> None:
-    with pytest.raises(UntranslatableError, match="local memory"):
-        hk.page(hk.Network(ball_layers()), tmp_path / "page.html")
 
 
 def ball_layers() -> list[tuple[Any, Any]]:

@@ -8,7 +8,8 @@ import re
 import pytest
 
 from harnack.webgpu import UntranslatableError
-from harnack.webgpu.llvm_parser import Constant, Load, Loop, Operation, parse
+from harnack.webgpu.kernel import Branch, Constant, Load, Loop, Operation
+from harnack.webgpu.llvm_parser import parse
 from harnack.webgpu.wgsl import to_shader
 
 # One number read, one operation, one result.
@@ -141,3 +142,55 @@ def test_comparisons_of_nan(how: str, of_nan: bool, of_order: bool) -> None:
     python = re.sub(r"!(?!=)", "1 - ", written)
     for x, wanted in ((1.0, of_order), (math.nan, of_nan)):
         assert bool(eval(python, {"v_f1": x, "v_f4": 2.0, "is_nan": math.isnan})) is wanted
+
+
+def test_a_branch_has_the_results_of_its_body() -> None:
+    kernel = parse(
+        KERNEL.format("""
+    %p3 = fcmp ogt <16 x float> %f1, zeroinitializer
+    br label %l_7_start
+
+l_7_start:
+    %u7_t = call i1 @llvm.vector.reduce.or.v16i1(<16 x i1> %p3)
+    br i1 %u7_t, label %l_7_t, label %l_7_next
+
+l_7_t:
+    %f4 = fneg <16 x float> %f1
+    br label %l_7_t_trailer
+
+l_7_t_trailer:
+    br label %l_7_next
+
+l_7_next:
+    %f2 = phi <16 x float> [ %f4, %l_7_t_trailer ], [ undef, %l_7_start ]""")
+    )
+    _, _, branch, _ = kernel.statements
+    assert isinstance(branch, Branch)
+    assert branch.condition == "%p3"
+    assert [(one.name, one.value) for one in branch.results] == [("%f2", "%f4")]
+    code = to_shader(kernel).code
+    assert "if (v_p3) {\n    let v_f4 = -v_f1;\n    v_f2 = v_f4;\n  }" in code
+
+
+def test_a_local_array_is_read_at_the_index_of_the_lane() -> None:
+    text = KERNEL.format("""
+    %r3 = fptoui <16 x float> %f1 to <16 x i32>
+    %f2_4 = call i32 @llvm.vector.reduce.umax.v16i32(<16 x i32> %r3)
+    br i1 %f2_6, label %l_2_u, label %l_2_n
+
+l_2_u:
+    %f2_7 = mul i32 %f2_4, 16
+    %f2_8 = getelementptr inbounds float, ptr %arr_1, i32 %f2_7
+    %f2_u = load <16 x float>, ptr %f2_8, align 64
+    br label %l_2_done
+
+l_2_n:
+    %f2_n = what is skipped
+    br label %l_2_done
+
+l_2_done:
+    %f2 = phi <16 x float> [ %f2_u, %l_2_u ], [ %f2_n, %l_2_n ]""")
+    text = text.replace("entry:\n", "entry:\n    %arr_1 = alloca float, i32 80, align 64\n", 1)
+    code = to_shader(parse(text)).code
+    assert "var v_arr_1: array<f32, 5>;" in code
+    assert "let v_f2_u = v_arr_1[v_r3];" in code

@@ -3,10 +3,10 @@ compares the results with Dr.Jit's. A kernel is the program that Dr.Jit compiles
 on arrays; it runs once for each lane, that is for each entry of the arrays, such as a ray.
 
 Dr.Jit prints a recorded kernel, loops included, as a program in LLVM's language. `llvm_parser`
-parses this text and `wgsl` writes it in WGSL, WebGPU's language. Labels that Dr.Jit prints tell
-which array each pointer belongs to (`recording`). So no field is implemented twice. The results are
-not trusted: for a sample of the rays of each call they are compared with Dr.Jit's own results
-(`device`).
+parses this text to statements (`kernel`), and `wgsl` writes them in WGSL, WebGPU's language. Labels
+that Dr.Jit prints tell which array each pointer belongs to (`recording`). So no field is
+implemented twice. The results are not trusted: for a sample of the rays of each call they are
+compared with Dr.Jit's own results (`device`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from harnack.webgpu.device import (
     find_device,
     pack_shader_data,
 )
-from harnack.webgpu.llvm_parser import UntranslatableError
+from harnack.webgpu.kernel import UntranslatableError
 from harnack.webgpu.recording import RecordedKernel, labeled_leaves, record_kernel
 
 __all__ = [

@@ -1,8 +1,5 @@
-"""Parses kernels that Dr.Jit recorded into operations on single lanes and nested loops. A kernel is
-a program in LLVM's language that runs once for each lane, that is for each entry of its arrays. A
-statement computes a result from operands, loads an entry of an array, or stores one. The parameters
-of a kernel are pointers to its arrays, and a label is the name of an array, which Dr.Jit prints as
-a comment. A table is an array that lanes read at computed indices.
+"""Parses kernels that Dr.Jit recorded into operations on single lanes, nested loops and branches
+(`kernel`). The text of a kernel is a program in LLVM's language.
 
 Dr.Jit writes a kernel for LLVM as a function of packets, vectors of several lanes. The program of
 every lane is the same, so the parser replaces packets by single lanes, and drops the masks that
@@ -14,126 +11,31 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
-__all__ = [
-    "ComputeKernel",
-    "Kind",
-    "Load",
-    "Loop",
-    "Operation",
-    "Store",
-    "UntranslatableError",
-    "parse",
-]
+from harnack.webgpu.kernel import (
+    Branch,
+    BranchResult,
+    ComputeKernel,
+    Constant,
+    Kind,
+    Load,
+    LocalArray,
+    LocalLoad,
+    LocalStore,
+    Loop,
+    LoopVariable,
+    Operand,
+    Operation,
+    Statement,
+    Store,
+    UntranslatableError,
+)
 
-Kind: TypeAlias = Literal["f32", "u32", "bool"]
+__all__ = ["parse"]
+
 _KINDS: dict[str, Kind] = {"float": "f32", "i32": "u32", "i1": "bool", "i8": "u32"}
-
-
-class UntranslatableError(NotImplementedError):
-    """The error for a kernel that contains an operation which the translation does not know."""
-
-
-@dataclass(frozen=True)
-class Constant:
-    """A constant operand. bits: its 32 bits as an integer; 0 or 1 for a "bool"."""
-
-    kind: Kind
-    bits: int
-
-
-Operand: TypeAlias = "str | Constant"
-
-
-@dataclass(frozen=True)
-class Operation:
-    """The statement result = name(operands). Each operand is a constant or the name of the result
-    of an earlier statement. kind: the type of the result."""
-
-    result: str
-    kind: Kind
-    name: str
-    operands: tuple[Operand, ...]
-
-
-@dataclass(frozen=True)
-class Load:
-    """The statement result = an entry of an array.
-
-    source: which entry is read. "lane": the entry of the lane. "number": the only entry. "table":
-        entry index * stride + offset if `mask` is True (or None), otherwise the result is 0.
-    parameter: the index of the array among the parameters of the kernel.
-    index, stride, offset, mask: for "table" only.
-    """
-
-    result: str
-    kind: Kind
-    source: Literal["lane", "number", "table"]
-    parameter: int
-    index: Operand | None = None
-    stride: int = 1
-    offset: int = 0
-    mask: Operand | None = None
-
-
-@dataclass(frozen=True)
-class Store:
-    """The statement that stores `value` as the lane's entry of an array. parameter: the index of
-    the array among the parameters of the kernel. kind: the type of the value."""
-
-    parameter: int
-    kind: Kind
-    value: Operand
-
-
-@dataclass(frozen=True)
-class LoopVariable:
-    """A variable that a loop changes. before: its value before the first iteration. after: its
-    value after an iteration, in terms of the values in that iteration."""
-
-    name: str
-    kind: Kind
-    before: Operand
-    after: Operand
-
-
-@dataclass
-class Loop:
-    """A loop. The statements `test` compute the operand `condition`. If it is True, the statements
-    `body` run and the test is made again; otherwise the loop ends."""
-
-    variables: list[LoopVariable] = field(default_factory=list[LoopVariable])
-    test: list[Statement] = field(default_factory=list["Statement"])
-    condition: Operand = ""
-    body: list[Statement] = field(default_factory=list["Statement"])
-
-
-Statement: TypeAlias = "Operation | Load | Store | Loop"
-
-
-@dataclass(frozen=True)
-class ComputeKernel:
-    """The program that each lane of a kernel runs, as a list of statements.
-
-    statements: the statements in order.
-    labels: for the index of a kernel parameter, the label of its array, if a label is known. An
-        array that lanes read at computed indices has the label of the values read from it.
-    """
-
-    statements: list[Statement]
-    labels: dict[int, str]
-
-    def walk(self) -> Iterator[Statement]:
-        """Yield all statements, including the statements in loops, in no particular order."""
-        pending = list(self.statements)
-        while pending:
-            statement = pending.pop()
-            yield statement
-            if isinstance(statement, Loop):
-                pending += [*statement.test, *statement.body]
 
 
 def parse(text: str) -> ComputeKernel:
@@ -146,10 +48,11 @@ def parse(text: str) -> ComputeKernel:
     if start < 0:
         raise UntranslatableError("this text holds no kernel of Dr.Jit for LLVM")
     body = text[start : text.index("\n}", start)]
-    reader = _LLVMParser()
+    width = re.search(r"<(\d+) x ", body)
+    reader = _LLVMParser(int(width.group(1)) if width else 1)
     for line in body.split("\n")[1:]:
         reader.parse_line(line)
-    return ComputeKernel(reader.statements, reader.labels)
+    return ComputeKernel(reader.statements, reader.labels, tuple(reader.local_arrays.values()))
 
 
 @dataclass
@@ -166,6 +69,14 @@ class _Address:
     index: Operand | None = None
     stride: int = 1
     mask: Operand | None = None
+
+
+@dataclass
+class _LocalAddress:
+    """The address of entry `index` of the local array with the name `array`."""
+
+    array: str
+    index: Operand
 
 
 _VECTOR = r"<\d+ x (\w+)>"
@@ -213,26 +124,41 @@ def _ignore(*groups: str) -> None:
 class _LLVMParser:
     """Parses a kernel, a program in LLVM's language, line by line. Each line assigns the result of
     an instruction to a name. Patterns recognize instructions, and each pattern has an action, a
-    method that notes something or appends a statement to the current block: the main program, or
-    the test or body of a loop. An `element` is the LLVM type of a number, such as "float". A label
-    is the name of an array, which Dr.Jit prints as a comment above an instruction.
+    method that notes something or appends a statement to the current block: the main program, the
+    test or body of a loop, or the body of a branch. An `element` is the LLVM type of a number, such
+    as "float". A label is the name of an array, which Dr.Jit prints as a comment above an
+    instruction.
 
+    Entry i of a local array is, for a packet, a packet: its lane k is number i * width + k of the
+    array. Dr.Jit reads and writes entries in two ways: in a block l_N_u if all active lanes of the
+    packet have the same index, which is then the largest of their indices; otherwise in a block
+    l_N_n. For a single lane both do the same, so the second is skipped.
+
+    width: the number of lanes of a packet.
     statements: the statements parsed so far.
     labels: for the index of a kernel parameter, the label of its array.
+    local_arrays: the local arrays by name.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, width: int) -> None:
         self.statements: list[Statement] = []
         self.labels: dict[int, str] = {}
+        self.local_arrays: dict[str, LocalArray] = {}
+        self._width = width
         self._tables: dict[str, int] = {}  # result -> parameter of the table it was read from
         self._current_block = self.statements
-        self._loops: list[Loop] = []
+        # The loops and branches that contain the current block, each with its number N and the
+        # block in which it is, and the condition of the next branch.
+        self._open: list[tuple[Loop | Branch, str, list[Statement]]] = []
+        self._branch: Branch | None = None  # whose results the next instructions name
+        self._branch_condition: Operand = ""
         self._aliases: dict[str, Operand] = {}  # result -> the value that it is another name of
         self._addresses: dict[str, _Address] = {}
+        self._local_addresses: dict[str, _LocalAddress] = {}
         self._records: dict[str, _Address] = {}  # result of several numbers -> their address
         self._label: str | None = None
         self._labeled = ""  # the variable that the label belongs to
-        self._block = ""
+        self._is_skipped = False  # the instructions of the current block
         self._patterns = {
             word: [(re.compile(pattern), action) for pattern, action in rules]
             for word, rules in self._grammar().items()
@@ -252,7 +178,7 @@ class _LLVMParser:
             self._label, self._labeled = text[1:].strip(), ""
         elif text.endswith(":"):
             self._enter_block(text[:-1])
-        elif text:
+        elif text and not self._is_skipped:
             result, _, instruction = text.rpartition(" = ")
             variable = result.partition("_")[0]
             # A label belongs to the instructions that compute one variable, such as %f12 and
@@ -268,36 +194,52 @@ class _LLVMParser:
                     # that the pattern has found.
                     action(*((result,) if result else ()), *match.groups())
                     return
-            if " = alloca " in text:
-                raise UntranslatableError(
-                    "a kernel of this field uses arrays in local memory (drjit.alloc_local), as "
-                    "those of networks and of long formulas do, which are not translated for other "
-                    "GPUs"
-                )
             raise UntranslatableError(
                 f"a kernel of this field holds what is not translated for other GPUs: {text[:160]}"
             )
 
     def _enter_block(self, block: str) -> None:
-        """Begin the block of the kernel named `block`. A loop has four blocks: the part before it,
-        its test (l_N_cond), its body (l_N_body) and the part after it (l_N_done)."""
-        self._block = block
-        if re.fullmatch(r"l_\d+_cond", block):
+        """Begin the block of the kernel named `block`.
+
+        A loop has four blocks: the part before it, its test (l_N_cond), its body (l_N_body) and the
+        part after it (l_N_done). A conditional statement is two branches: l_N_t runs if a condition
+        is True, and l_N_f if another one is; the results of the first are named in l_N_next, and
+        those of the second in l_N_end. A local array is accessed in l_N_u or l_N_n, and the results
+        are named in l_N_done.
+        """
+        match = re.fullmatch(r"l_(\d+)_(\w+)", block)
+        number, part = match.groups() if match is not None else ("", block)
+        self._is_skipped = part == "n"
+        self._branch = None
+        innermost = self._open[-1][0] if self._open and self._open[-1][1] == number else None
+        if part == "cond":
             loop = Loop()
-            self._current_block.append(loop)
-            self._loops.append(loop)
-            self._current_block = loop.test
-        elif re.fullmatch(r"l_\d+_body", block):
-            self._current_block = self._loops[-1].body
-        elif re.fullmatch(r"l_\d+_done", block):
-            loop = self._loops.pop()
+            self._begin(loop, number, loop.test)
+        elif part == "body" and isinstance(innermost, Loop):
+            self._current_block = innermost.body
+        elif part == "done" and isinstance(innermost, Loop):
             # The values after an iteration were kept as text until all of the body was known.
-            loop.variables = [
+            innermost.variables = [
                 replace(variable, after=self._value(str(variable.after), variable.kind))
-                for variable in loop.variables
+                for variable in innermost.variables
             ]
-            outer_loop = self._loops[-1] if self._loops else None
-            self._current_block = outer_loop.body if outer_loop else self.statements
+            self._end()
+        elif part in ("t", "f"):
+            branch = Branch(self._branch_condition)
+            self._begin(branch, number, branch.body)
+        elif part in ("next", "end") and isinstance(innermost, Branch):
+            self._end()
+            self._branch = innermost
+
+    def _begin(self, statement: Loop | Branch, number: str, block: list[Statement]) -> None:
+        """Append a loop or a branch with a number, and make one of its blocks the current one."""
+        self._current_block.append(statement)
+        self._open.append((statement, number, self._current_block))
+        self._current_block = block
+
+    def _end(self) -> None:
+        """End the innermost loop or branch."""
+        *_, self._current_block = self._open.pop()
 
     def _value(self, text: str, kind: Kind) -> Operand:
         """Return the operand that a text stands for: the name of a result, or a constant of the
@@ -349,10 +291,14 @@ class _LLVMParser:
             # Control of packets and branches, and other names of values.
             "br": [
                 (rf"br i1 ({_NAME}), label %l_\d+_body, label %l_\d+_done", self._test),
+                (rf"br i1 ({_NAME}), label %l_\d+_[tf], label %\w+", self._branch_test),
                 (r"br .*", _ignore),
             ],
             "ret": [(r"ret void", _ignore)],
             "phi": [
+                (rf"phi {_VECTOR} \[ (\S+), %l_\d+_u \], \[ \S+, %l_\d+_n \]", self._alias),
+                (rf"phi {_VECTOR} \[ (\S+), %l_\d+_[tf]_trailer \], \[ undef, %\w+ \]",
+                self._branch_result),
                 (rf"phi {_VECTOR} \[ (\S+), %\w+ \], \[ (\S+), %\w+ \]", self._phi),
                 (r"phi i64 .*", _ignore),
             ],
@@ -363,7 +309,9 @@ class _LLVMParser:
                 (rf"shufflevector {_VECTOR} ({_NAME}), .* zeroinitializer", self._alias)
             ],
             # Arrays.
+            "alloca": [(r"alloca (\w+), i32 (\d+)", self._local_array)],
             "getelementptr": [
+                (r"getelementptr inbounds \w+, ptr (%arr_\d+), i32 (\S+)", self._local_entry),
                 (r"getelementptr inbounds ptr, ptr %params, i32 (\d+)", self._parameter),
                 (rf"getelementptr inbounds \w+, ptr ({_NAME}), i64 %index", self._pointer),
                 (r"getelementptr \[\d+ x \w+\], ptr @\w+, .*", _ignore),  # zeros
@@ -381,6 +329,8 @@ class _LLVMParser:
             ],
             # Arithmetic.
             **dict.fromkeys(_BINARY, binary),
+            # The index of an entry of a local array times the width of packets.
+            "mul": [(rf"mul (i32) (\S+), {self._width}", self._alias), *binary],
             "add": [
                 (rf"add {_VECTOR} ({_NAME}), <i32 0, i32 1, .*>", self._alias),  # the lane's index
                 (r"add i64 .*", _ignore),
@@ -397,6 +347,7 @@ class _LLVMParser:
             "icmp": [
                 (rf"(icmp \w+) {_VECTOR} {_OPERAND}, {_OPERAND}", self._compare),
                 (r"icmp uge i64 .*", _ignore),
+                (r"icmp eq i32 .*", _ignore),  # of the indices of a packet
             ],
             "select": [
                 (rf"select <\d+ x i1> {_OPERAND}, <\d+ x ptr> ({_NAME}), .*",
@@ -406,6 +357,8 @@ class _LLVMParser:
             ],
             "call": [
                 (r"call i1 @llvm\.vector\.reduce\.or\.v\d+i1\(<\d+ x (i1)> (\S+)\)", self._alias),
+                (r"call i32 @llvm\.vector\.reduce\.umin\..*", _ignore),  # of indices
+                (r"call i32 @llvm\.vector\.reduce\.umax\.\w+\(<\d+ x (i32)> (\S+)\)", self._alias),
                 (r"call (?:fastcc )?\[\d+ x <\d+ x \w+>\] @gather_\d+x\w+\(<\d+ x ptr> "
                  rf"({_NAME})\)", self._gather_record),
                 (rf"call {_VECTOR} @llvm\.masked\.gather\S*\(<\d+ x ptr> ({_NAME}), i32 \d+, "
@@ -421,7 +374,20 @@ class _LLVMParser:
     def _test(self, condition: str) -> None:
         """Note the condition under which the current loop goes on. The instruction is the branch to
         the loop's body, "br i1 %condition, ..."."""
-        self._loops[-1].condition = self._value(condition, "bool")
+        loop = self._open[-1][0]
+        assert isinstance(loop, Loop)
+        loop.condition = self._value(condition, "bool")
+
+    def _branch_test(self, condition: str) -> None:
+        """Note the condition of the next branch. The instruction is "br i1 %condition, ..."."""
+        self._branch_condition = self._value(condition, "bool")
+
+    def _branch_result(self, result: str, element: str, value: str) -> None:
+        """Add a result to the branch that has ended, such as "%result = phi <8 x float> [ %value,
+        ... ], [ undef, ... ]". element: its LLVM type, such as "float"."""
+        assert self._branch is not None
+        kind = self._kind(element)
+        self._branch.results.append(BranchResult(result, kind, self._value(value, kind)))
 
     def _phi(self, result: str, element: str, before: str, after: str) -> None:
         """Add a variable to the current loop, such as "%result = phi <8 x float> [ %before, ... ],
@@ -430,7 +396,10 @@ class _LLVMParser:
         kind = self._kind(element)
         # The value after an iteration stays text here: its definition comes later, in the body.
         variable = LoopVariable(result, kind, self._value(before, kind), after)
-        self._loops[-1].variables.append(variable)
+        loop = self._open[-1][0] if self._open else None
+        if not isinstance(loop, Loop):
+            raise UntranslatableError(f"{result} belongs to no loop that is translated")
+        loop.variables.append(variable)
 
     def _alias(self, result: str, element: str, value: str) -> None:
         """Note that the result of an instruction is another name of a value, as in "%result =
@@ -460,19 +429,41 @@ class _LLVMParser:
         source = self._addresses[pointer]
         self._current_block.append(Load(result, self._kind(element), "number", source.parameter))
 
+    def _local_array(self, result: str, element: str, count: str) -> None:
+        """Note a local array. The instruction is "%result = alloca float, i32 count", for a packet.
+        element: the LLVM type of its numbers, here "float"."""
+        size = int(count) // self._width
+        self.local_arrays[result] = LocalArray(result, self._kind(element), size)
+
+    def _local_entry(self, result: str, array: str, place: str) -> None:
+        """Note that the result of "%result = getelementptr inbounds float, ptr %array, i32 place"
+        is the address of an entry of a local array. place: a number, which the width divides; or
+        the name of a product with the width, which is another name of the index of the entry."""
+        index = self._value(place, "u32")
+        if isinstance(index, Constant):
+            index = Constant("u32", index.bits // self._width)
+        self._local_addresses[result] = _LocalAddress(array, index)
+
     def _load_lane(self, result: str, element: str, pointer: str) -> None:
         """Append a statement for "%result = load <8 x float>, ptr %pointer": it loads the lane's
-        entry of an array. element: its LLVM type, here "float"."""
+        entry of an array, or an entry of a local array. element: its LLVM type, here "float"."""
+        kind = self._kind(element)
+        if (local := self._local_addresses.get(pointer)) is not None:
+            self._current_block.append(LocalLoad(result, kind, local.array, local.index))
+            return
         source = self._addresses[pointer]
-        self._current_block.append(Load(result, self._kind(element), "lane", source.parameter))
+        self._current_block.append(Load(result, kind, "lane", source.parameter))
 
     def _store(self, element: str, value: str, pointer: str) -> None:
         """Append a statement for "store <8 x float> %value, ptr %pointer": it stores a value as the
-        lane's entry of an array. element: its LLVM type, here "float"."""
+        lane's entry of an array, or as an entry of a local array. element: its LLVM type, here
+        "float"."""
         kind = self._kind(element)
-        self._current_block.append(
-            Store(self._addresses[pointer].parameter, kind, self._value(value, kind))
-        )
+        stored = self._value(value, kind)
+        if (local := self._local_addresses.get(pointer)) is not None:
+            self._current_block.append(LocalStore(local.array, local.index, stored))
+        else:
+            self._current_block.append(Store(self._addresses[pointer].parameter, kind, stored))
 
     def _record(self, result: str, stride: str, pointer: str, index: str) -> None:
         """Note that the result of "%result = getelementptr [stride x float], ptr %pointer, <8 x

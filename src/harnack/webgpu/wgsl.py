@@ -1,7 +1,7 @@
 """Translates recorded kernels to WGSL, WebGPU's language. A kernel is a program that runs once for
-each lane, that is for each entry of its arrays; `llvm_parser` has parsed it into statements, whose
-operands are constants or results of earlier statements. The WGSL program is called a shader. A
-kernel's parameters are its arrays, and a label is the name of an array.
+each lane, that is for each entry of its arrays; `llvm_parser` has parsed it into statements
+(`kernel`), whose operands are constants or results of earlier statements. The WGSL program is
+called a shader. A kernel's parameters are its arrays, and a label is the name of an array.
 
 WGSL promises less than LLVM: division may be off by 2.5 units in the last place, `fma` may round
 twice, subnormal numbers may be zero, and a compiler may assume that infinities and NaN do not
@@ -15,10 +15,14 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from harnack.webgpu.llvm_parser import (
+from harnack.webgpu.kernel import (
+    Branch,
     ComputeKernel,
     Constant,
     Load,
+    LocalArray,
+    LocalLoad,
+    LocalStore,
     Loop,
     Operand,
     Operation,
@@ -127,6 +131,8 @@ class _WGSLWriter:
 
     def shader(self) -> Shader:
         """Write the whole kernel, and return the shader."""
+        for array in self._kernel.local_arrays:
+            self._declare(array)
         for statement in self._kernel.statements:
             self._write(statement)
         names = {
@@ -170,10 +176,20 @@ class _WGSLWriter:
         """Append a line of code, indented."""
         self._lines.append("  " * self._depth + line)
 
+    def _declare(self, array: LocalArray) -> None:
+        """Append the declaration of a local array."""
+        self._emit(f"var {_variable(array.name)}: array<{array.kind}, {array.size}>;")
+
     def _write(self, statement: Statement) -> None:
         """Append the code of a statement."""
         if isinstance(statement, Loop):
             self._loop(statement)
+        elif isinstance(statement, Branch):
+            self._branch(statement)
+        elif isinstance(statement, LocalLoad):
+            self._emit(f"let {_variable(statement.result)} = {self._local_entry(statement)};")
+        elif isinstance(statement, LocalStore):
+            self._emit(f"{self._local_entry(statement)} = {self._operand_text(statement.value)};")
         elif isinstance(statement, Store):
             slot = self._stores.index(statement)
             value = self._operand_text(statement.value)
@@ -206,6 +222,24 @@ class _WGSLWriter:
             self._emit(f"{_variable(node.name)} = next_{_variable(node.name)};")
         self._depth -= 1
         self._emit("}")
+
+    def _branch(self, branch: Branch) -> None:
+        """Append the code of a branch: its results, which are 0 at first, and its body, which
+        assigns to them."""
+        for result in branch.results:
+            self._emit(f"var {_variable(result.name)}: {result.kind};")
+        self._emit(f"if ({self._operand_text(branch.condition)}) {{")
+        self._depth += 1
+        for node in branch.body:
+            self._write(node)
+        for result in branch.results:
+            self._emit(f"{_variable(result.name)} = {self._operand_text(result.value)};")
+        self._depth -= 1
+        self._emit("}")
+
+    def _local_entry(self, access: LocalLoad | LocalStore) -> str:
+        """Return the WGSL expression of the entry of a local array that a statement accesses."""
+        return f"{_variable(access.array)}[{self._operand_text(access.index)}]"
 
     def _load(self, load: Load) -> str:
         """Return the WGSL expression that reads an entry of an array from a buffer (`Shader`
@@ -244,7 +278,7 @@ class _WGSLWriter:
         # The second operator of a pair is for truth values.
         if name in _BIT_OPERATORS:
             return f"{a[0]} {_BIT_OPERATORS[name][operation.kind == 'bool']} {a[1]}"
-        if name in _FUNCTIONS:
+        if name in _FUNCTIONS and not variant:  # with a variant, "trunc" is a conversion
             return f"{_FUNCTIONS[name]}({', '.join(a)})"
         match name:
             case "fneg":
