@@ -6,9 +6,7 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
     from harnack.enclosures.samples import Ray, Sample
     from harnack.fields.evaluator import Plan
 
-__all__ = ["TapeEvaluator", "compiled_formulas", "recorded_tape", "tape_evaluator"]
+__all__ = ["TapeEvaluator", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted, and combinations of more than half as many, since
 # much of them is left out in each cell; shorter ones are compiled.
@@ -45,26 +43,9 @@ _MIN_INSTRUCTIONS = 40
 # Equal operations, as of equal parts, are one instruction, but are compiled once for each part.
 # Formulas of more operations, where equal ones count each time, are interpreted.
 _MAX_OPERATIONS = 80
-# Formulas of more instructions are not compiled, even where they cannot be interpreted.
-_MAX_COMPILED = 300
 # Rounding may move points by this many machine epsilons of their coordinates and of the length
 # along a ray; where that is more than a quarter of the margin of cells, the whole list is run.
 _ROUNDINGS = 64.0
-
-
-# Whether formulas are compiled, whatever their length (`compiled_formulas`).
-_ONLY_COMPILED: ContextVar[bool] = ContextVar("compiled_formulas", default=False)
-
-
-@contextmanager
-def compiled_formulas() -> Generator[None]:
-    """A context within which formulas of any length are compiled: for kernels that are translated
-    for other GPUs, as calls of functions and arrays of local memory are not."""
-    token = _ONLY_COMPILED.set(True)
-    try:
-        yield
-    finally:
-        _ONLY_COMPILED.reset(token)
 
 
 # For each field its tape, and its cells by levels.
@@ -96,9 +77,6 @@ def tape_evaluator(
     field: a field with a method `formula`.
     shortest: the largest number of instructions of a short formula; None for the number from which
         on interpreting was measured to be quicker.
-
-    Raises:
-        NotImplementedError: a formula that must be compiled (`compiled_formulas`) is too long.
     """
     tape = recorded_tape(field)
     if shortest is None:
@@ -106,19 +84,11 @@ def tape_evaluator(
         shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
     if tape is None or (len(tape) <= shortest and tape.call_count <= _MAX_OPERATIONS):
         return None
-    if _ONLY_COMPILED.get():
-        count = max(len(tape), tape.call_count)
-        if count > _MAX_COMPILED:
-            raise NotImplementedError(
-                f"a formula of {count:,} instructions takes minutes to compile, and pages and "
-                "other GPUs cannot interpret it yet: render it here, or show its mesh "
-                "(harnack.mesh)"
-            )
-        return None
     uploaded: _UploadedTape = _upload(field, backend, plan.levels)
     lipschitz = getattr(field, "lipschitz", None)
     constant = dr.opaque(backend.Float, float(lipschitz)) if lipschitz is not None else None
     whole = uploaded.program.formula(dr.opaque(backend.UInt32, 0))
+    dr.eval(whole.begin, whole.end)  # data of kernels, which are recorded (`harnack.webgpu`)
     return TapeEvaluator(field, whole, constant, uploaded)
 
 

@@ -25,7 +25,6 @@ import numpy as np
 from harnack.backend import choose_backend, to_vector3
 from harnack.fields import Solid
 from harnack.fields.solid_angles.solid_angle import SolidAngle
-from harnack.fields.tape_evaluator import compiled_formulas
 from harnack.geometry import HalfSpace, Volume, VolumeIntersection
 from harnack.live.legend_data import EVALUATIONS_TOP, legends
 from harnack.live.live_framing import Framing, extreme_points
@@ -444,7 +443,6 @@ class LiveScene:
         tolerance = HitTolerance(_TOLERANCE / self.placement.scale)
         return replace(body, surface=replace(body.surface, tolerance=tolerance))
 
-    @compiled_formulas()
     def place(self, body: StudioObject) -> PlacedSurface:
         """Return the surface of the object `body`, moved to the stage and prepared for tracing in
         single precision."""
@@ -572,7 +570,6 @@ def _curve_of(bodies: Sequence[StudioObject]) -> SolidAngle | None:
     return curves[0] if len(curves) == 1 else None
 
 
-@compiled_formulas()
 def _kernel_data(
     body: StudioObject, placed: PlacedSurface, origins: FloatArray, directions: FloatArray
 ) -> JsonDict:

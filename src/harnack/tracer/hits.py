@@ -24,7 +24,6 @@ from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active
 from harnack.backend.tensors import array_to_tensor, is_tensor
 from harnack.cluster.dask_arrays import accepts_dask_arrays
-from harnack.fields.tape_evaluator import compiled_formulas
 from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
 from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.level_contact import HitTolerance, RayStatus
@@ -411,7 +410,6 @@ def _positions(o: Vec3, d: Vec3, t: Real) -> Vec3:
 # Tracing on other GPUs, by WebGPU.
 
 
-@compiled_formulas()
 def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     """Trace rays on another device, by WebGPU, and return the hits as NumPy arrays.
 

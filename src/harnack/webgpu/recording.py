@@ -18,7 +18,7 @@ import gc
 import inspect
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -69,7 +69,7 @@ def record_kernel(
             dr.set_label(array, label)
         for array in _find_arrays(data):
             labels.label_array(array)
-        with dr.suspend_grad(), labels.label_gathers():
+        with dr.suspend_grad(), labels.label_gathers(), _switches_as_conditions():
             outputs = compute(**lanes)
         results = dict(labeled_leaves("result", dict(outputs)))
         # Constants need no kernel.
@@ -144,6 +144,42 @@ def _garbage_collection_paused() -> Generator[None]:
     finally:
         if was_enabled:
             gc.enable()
+
+
+@contextlib.contextmanager
+def _switches_as_conditions() -> Generator[None]:
+    """Context manager within which `drjit.switch` of this thread records conditional statements.
+
+    Dr.Jit calls the functions of a switch by a table of addresses, which is no part of a kernel's
+    text. The conditions form a binary tree, so that a lane evaluates few of them.
+    """
+    module = cast("Any", dr)
+    original, thread = module.switch, threading.get_ident()
+
+    def switch(index: Any, targets: Sequence[Callable[..., Any]], *args: Any, **kwargs: Any) -> Any:
+        """Call `drjit.switch` with these arguments, or do the same by conditional statements if
+        this thread records."""
+        if threading.get_ident() != thread or kwargs:
+            return original(index, targets, *args, **kwargs)
+        if len(targets) == 1:
+            return targets[0](*args)
+        middle = len(targets) // 2
+
+        def first_half(index: Any, *args: Any) -> Any:
+            """Call one of the targets before the middle."""
+            return switch(index, targets[:middle], *args)
+
+        def second_half(index: Any, *args: Any) -> Any:
+            """Call one of the other targets."""
+            return switch(index - middle, targets[middle:], *args)
+
+        return dr.if_stmt((index, *args), index < middle, first_half, second_half)
+
+    module.switch = switch
+    try:
+        yield
+    finally:
+        module.switch = original
 
 
 class _ArrayLabels:
