@@ -96,6 +96,22 @@ def test_lists_hold_coordinates_only_where_others_than_balls_read_them() -> None
     assert boxes.lengths.tolist() == [1, 2, 4]
 
 
+def test_equal_lists_are_stored_once() -> None:
+    model = random_model(np.random.default_rng(0), 40, 0.3)
+    cells = TapeCells.of(record(model.formula), np.full(3, -1.5), np.full(3, 1.5), (0.0,))
+    distinct, index = cells.lists.distinct()
+
+    def text(lists: BoxTapes, k: int) -> Any:
+        entries = slice(lists.starts[k], lists.starts[k + 1])
+        operands = lists.operands[:, entries] - lists.starts[k]
+        return (*lists.instructions[entries].tolist(), -1, *operands.ravel().tolist())
+
+    assert len(distinct) < len(cells.lists) / 5
+    assert len({text(distinct, k) for k in range(len(distinct))}) == len(distinct)
+    for k in range(0, len(cells.lists), 7):
+        assert text(cells.lists, k) == text(distinct, int(index[k]))
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("levels", [(), (0.0,), (-0.05, 0.1)])
 def test_cells_have_the_values_that_matter(seed: int, levels: tuple[float, ...]) -> None:
@@ -289,21 +305,3 @@ def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     assert kernels
     assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
-
-
-def test_pages_refuse_models_that_compile_for_minutes(tmp_path: Path) -> None:
-    """Kernels of pages are translated, which calls and local memory are not."""
-    centers = np.random.default_rng(4).uniform(-1, 1, (400, 3)).tolist()
-    spheres = [hk.Sphere(0.3, tuple(c)) for c in centers]
-    with pytest.raises(NotImplementedError, match="instructions takes minutes to compile"):
-        hk.page(hk.solids.union(*spheres), tmp_path / "a.html")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_pages_compile_short_models(tmp_path: Path) -> None:
-    centers = np.random.default_rng(4).uniform(-1, 1, (10, 3)).tolist()
-    model = hk.solids.union(*(hk.Sphere(0.3, tuple(c)) for c in centers))
-    assert isinstance(model.evaluator(choose_backend("single")), tape_evaluator.TapeEvaluator)
-    hk.page(model, tmp_path / "a.html")
-    assert (tmp_path / "a.html").stat().st_size > 10_000

@@ -34,6 +34,9 @@ OTHERS: dict[str, Callable[[], hk.Field]] = {
     "log": lambda: hk.fields.RiemannSurface("log", domain=hk.Ball(radius=1.0)),
     "asin": lambda: hk.fields.RiemannSurface("asin", domain=hk.Ball(radius=1.0)),
     "level curves": lambda: hk.fields.LevelCurves("log"),
+    "thousand spheres": lambda: hk.union(
+        [hk.Sphere(0.07, (x, y, z)) for x, y, z in np.random.default_rng(4).random((1000, 3))]
+    ),
 }
 
 
@@ -104,6 +107,34 @@ def check_same_results(compute: Callable[..., dict[str, Any]], count: int = 50) 
             np.testing.assert_array_equal(found[label] != 0, expected)
         else:
             np.testing.assert_allclose(found[label].view(expected.dtype), expected, rtol=1e-5)
+
+
+def test_switches() -> None:
+    """In a loop, with a loop and an array within, masks, and one function alone."""
+    backend = choose_backend("single")
+    table = backend.Float(np.arange(7) ** 0.5)
+
+    def gathers(x: Any, n: Any, is_large: Any) -> tuple[Any, Any, Any]:
+        return x + dr.gather(backend.Float, table, n, is_large), n + 1, x > 2
+
+    def loops(x: Any, n: Any, is_large: Any) -> tuple[Any, Any, Any]:
+        double = dr.while_loop((x, n), lambda _, k: k < 5, lambda x, k: (x * 2, k + 1))
+        return double[0] * 0.125, n, ~is_large
+
+    def constant(x: Any, n: Any, is_large: Any) -> tuple[Any, Any, Any]:
+        return backend.Float(0.5), n * 2, backend.Bool(True)
+
+    def compute(x: Any, n: Any) -> dict[str, Any]:
+        def body(k: Any, x: Any, n: Any, is_large: Any) -> tuple[Any, ...]:
+            functions = [gathers, loops, constant]
+            return k + 1, *dr.switch((k + n) % 3, functions, x, n % 7, is_large)
+
+        state = (backend.UInt32(n), x, n, x > 1)
+        _, x, n, is_large = dr.while_loop(state, lambda k, *_: k < 7, body)
+        (one,) = dr.switch(n * 0, [lambda x: (x + 1,)], x)
+        return {"x": one, "n": n, "large": is_large}
+
+    check_same_results(compute)
 
 
 def test_local_arrays() -> None:

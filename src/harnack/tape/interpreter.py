@@ -44,7 +44,7 @@ class TapeProgram:
 
     operations: the operations that occur. The index after the last one stands for reading an
         operand from local memory.
-    words: the instructions of all lists, `_WORDS` integers for each.
+    words: the instructions of all lists, `_WORDS` integers for each; equal lists are stored once.
     constants: rows of lower ends of constants and, in single precision, of their upper ends.
     begins, ends: for each list the first instruction, and that after the last one.
     constant_count: the length of rows of lower ends.
@@ -67,6 +67,7 @@ class TapeProgram:
         Raises:
             ValueError: a list keeps more than 65,536 results at a time.
         """
+        lists, index = lists.distinct()
         words, before, count = _encode(lists)
         ends = rounded_ends(backend, lists.tape.constants[_rows_of_constants(lists.tape)])
         is_exact = backend.precision == "double"
@@ -76,8 +77,8 @@ class TapeProgram:
             lists.tape.operations,
             upload_integers(backend, words.ravel()),
             RecordTable.upload(backend, rows),
-            upload_integers(backend, before[lists.starts[:-1]]),
-            upload_integers(backend, before[lists.starts[1:]]),
+            upload_integers(backend, before[lists.starts[:-1]][index]),
+            upload_integers(backend, before[lists.starts[1:]][index]),
             ends[0].shape[1],
             local_size(count),
         )

@@ -13,6 +13,7 @@ Sources: Duff 1992 (pruning of constructive solid geometry by interval arithmeti
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -157,6 +158,21 @@ class BoxTapes:
             np.concatenate([part.instructions for part in parts]),
             np.concatenate([part.operands + np.int32(offset) for part, offset in pairs], axis=1),
         )
+
+    def distinct(self) -> tuple[BoxTapes, IntArray]:
+        """The lists without repetitions, of which many boxes have few; and for each box (m,) the
+        index of its list among them."""
+        relative = self.operands - self.starts[self.boxes].astype(np.int32)
+        columns = np.column_stack([self.instructions, *relative]).astype(np.int32)
+        text, ends = columns.tobytes(), (self.starts * columns.strides[0]).tolist()
+        index_of: dict[bytes, int] = {}
+        first: list[int] = []
+        index = np.empty(len(self), np.int64)
+        for box, (start, end) in enumerate(itertools.pairwise(ends)):
+            index[box] = index_of.setdefault(text[start:end], len(first))
+            if index[box] == len(first):
+                first.append(box)
+        return self.subset(np.array(first, np.int64)), index
 
     @functools.cached_property
     def _groups(self) -> list[tuple[int, EntryArray]]:
