@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import harnack as hk
+from harnack import webgpu
 from harnack.backend import choose_backend, to_numpy
 from harnack.geometry.example_meshes import icosphere
 from harnack.tracer import hits as tracing
@@ -186,7 +187,7 @@ def test_a_device_that_lies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     own = hk.trace(field, o, d, tolerance=tolerance, precision="single")
     refused = 0
     for line in range(0, 600, 30):
-        monkeypatch.setattr(tracing, "find_device", lambda k=line: Lying(find_device(), k))
+        monkeypatch.setattr(webgpu, "find_device", lambda k=line: Lying(find_device(), k))
         try:
             other = hk.trace(field, o, d, tolerance=tolerance, backend="webgpu")
         except DeviceMismatchError:
@@ -201,7 +202,7 @@ def test_a_device_that_lies_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_device_is_named_that_lies(monkeypatch: pytest.MonkeyPatch) -> None:
     field = hk.Gyroid(0.5, domain=hk.Ball(radius=1.0))
     o, d, _ = rays(field, 4096)
-    monkeypatch.setattr(tracing, "find_device", lambda: Lying(find_device(), 0))
+    monkeypatch.setattr(webgpu, "find_device", lambda: Lying(find_device(), 0))
     with pytest.raises(DeviceMismatchError, match=r"a device that lies does not .*leave out back"):
         hk.trace(field, o, d, backend="webgpu")
 
