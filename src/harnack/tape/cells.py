@@ -29,6 +29,8 @@ _MIN_CELL = 2.0**-13
 _BORDER = 1 / 16
 # The smallest and the largest number of times that the box is divided.
 _MIN_DEPTH, _MAX_DEPTH = 3, 7
+# The largest number where nothing can be left out of a list.
+_DEPTH_OF_WHOLE_LISTS = 4
 # Where all values matter, lists are longer, and the box is divided this number of times less.
 _COARSER = 2
 # Cells are divided no further if all of their octants would be more, or the lists of these would
@@ -72,6 +74,8 @@ class TapeCells(GridData):
         """
         depth = round(3.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
         depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
+        if all(operation.choice is None for operation in tape.operations):
+            depth = min(depth, _DEPTH_OF_WHOLE_LISTS)  # nothing is left out: cells are only empty
         reach = float(np.abs([lower, upper]).max())
         longest = float((upper - lower).max()) * (1 + _BORDER)
         while depth > 0 and longest / 2**depth < _MIN_CELL * reach:
