@@ -30,6 +30,7 @@ SOLIDS = {
     "moved": hk.Torus(1.0, 0.3).translated((1.0, 2.0, 3.0)).rotated(30.0, "x").scaled(2.0),
     "cut": hk.Sphere(1.0) - hk.Cuboid((1.0, 1.0, 4.0)) | hk.Capsule((0, 0, -1), (0, 0, 1), 0.2),
     "twisted": hk.Cuboid((0.8, 0.8, 2.0)).twisted(math.degrees(0.5)),
+    "struts": hk.solids.struts([(0, 0, 0), (1, 0, 0), (0, 1, 1)], [(0, 1), (0, 2)], 0.1),
     "tube": hk.Tube(example_curves.torus_knot(2, 3, 12), 0.1),
     "outlines": hk.Extrusion(
         [[(0, 0), (2, 0), (0, 2)], [(0.2, 0.2), (1, 0.2), (0.2, 1)]], 0.5, twist=40.0, taper=0.5

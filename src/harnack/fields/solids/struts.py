@@ -11,6 +11,7 @@ import numpy as np
 
 from harnack.arithmetic import cone_distance, minimum, segment_distance
 from harnack.arithmetic.operators import Tally, tally_of
+from harnack.backend import FloatArray, IntArray
 from harnack.backend.validation import (
     as_real_array,
     check_coordinate_size,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from harnack.backend import Backend, FloatArray, IntArray
+    from harnack.backend import Backend
     from harnack.fields.formula_evaluator import FormulaEvaluator
     from harnack.fields.solids.solid import Solid
     from harnack.geometry import Volume
