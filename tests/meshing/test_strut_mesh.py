@@ -105,3 +105,16 @@ def test_meshes_of_single_struts() -> None:
 def test_an_enormous_mesh_of_struts_is_refused() -> None:
     with pytest.raises(hk.MeshingError, match="struts within 1e-09 have more than"):
         strut_mesh.strut_manifold(Struts.of([hk.Capsule((0, 0, 0), (1, 0, 0))]), 0.0, 1e-9)
+
+
+@pytest.mark.parametrize("length", [1e-7, 1e-10, 1e-13])
+def test_an_edge_far_shorter_than_others_has_a_direction(length: float) -> None:
+    nodes = [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0.6 * length, 0.8 * length]]
+    mesh = hk.mesh(hk.solids.struts(np.array(nodes), [[0, 1], [2, 3]], 0.1), tolerance=0.01)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(0.01 * np.pi + 0.008 / 3 * np.pi, rel=0.04)
+
+
+def test_a_tolerance_below_rounding_is_refused_at_once() -> None:
+    with pytest.raises(hk.MeshingError, match="struts within 5e-21 have more than"):
+        hk.mesh(hk.Capsule((0, 0, 0), (1, 0, 0), 0.1), tolerance=1e-20)

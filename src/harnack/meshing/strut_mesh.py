@@ -30,7 +30,8 @@ __all__ = ["strut_manifold"]
 # The smallest number of points around, also for struts far thinner than the tolerance.
 _LEAST_AROUND = 6
 _MOST_VERTICES = 8_000_000
-# Lengths that differ by less than this fraction of the longest edge count as equal.
+# Lengths that differ by less than this fraction of them count as equal, and radii that differ by
+# less than this fraction of the longest edge.
 _SAME = 1e-9
 # So many pairs of halves are compared at once, and at most so many in all.
 _PAIRS_AT_ONCE, _MOST_PAIRS = 500_000, 60_000_000
@@ -58,6 +59,9 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold |
     radii = struts.radii + level
     if (radii[edges] <= 0).all():
         return Manifold()
+    # Each ring needs more points than these, by which the number is found below.
+    around = 2 * math.pi / math.sqrt(12 * tolerance / float(radii[edges].max()))
+    _check_size(int(around), tolerance)
     graph = _Graph.of(struts.nodes, edges, radii, tolerance)
     if graph is None:
         return None
@@ -134,17 +138,20 @@ class _Graph:
         first, last = slope * ends[:, 0], length + slope * ends[:, 1]
         share = (0.5 * length - first) / (last - first)
         middle_radii = cosine * (ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
-        unit = _SAME * float(length.max())
-        steps = np.rint(vector / unit).astype(np.int64)
+        # Directions and lengths, each to a fraction of itself: edges may be far shorter than others.
+        steps = np.rint(vector / length[:, None] / _SAME).astype(np.int64)
+        longest = float(length.max())
+        size = np.rint(np.log(length / longest) / _SAME).astype(np.int64)
+        thickness = np.rint(ends / (_SAME * longest)).astype(np.int64)
         vectors = np.stack([vector, -vector], axis=1).reshape(-1, 3)
-        # The shape of a half: its vector, and both radii.
+        # The shape of a half: its direction and length, and both radii.
         shape = np.stack(
             [
-                np.column_stack([steps * sign, np.rint(ends[:, order] / unit).astype(np.int64)])
+                np.column_stack([steps * sign, size, thickness[:, order]])
                 for sign, order in ((1, [0, 1]), (-1, [1, 0]))
             ],
             axis=1,
-        ).reshape(-1, 5)
+        ).reshape(-1, 6)
         kinds = np.unique(shape, axis=0, return_inverse=True)[1].reshape(-1)
         return cls(
             nodes, edges, around, step, ends.ravel(), vectors, _frames(steps), middle_radii,
