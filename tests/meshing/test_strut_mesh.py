@@ -118,3 +118,32 @@ def test_an_edge_far_shorter_than_others_has_a_direction(length: float) -> None:
 def test_a_tolerance_below_rounding_is_refused_at_once() -> None:
     with pytest.raises(hk.MeshingError, match="struts within 5e-21 have more than"):
         hk.mesh(hk.Capsule((0, 0, 0), (1, 0, 0), 0.1), tolerance=1e-20)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "edges", "radii", "level"),
+    [
+        ([[0, 0, 0], [0.3, 0, 0], [0, 1, 0.2], [3, 0, 0]], [[0, 1], [0, 2], [3, 0]], 0, 0.0),
+        ([[0, 0, 0], [0.1, 0.2, -0.1]], [[0, 1]], 2, 0.0),
+        (FORK, [[0, 1], [2, 0], [0, 3]], 1, -0.11),
+        (FORK, [[0, 1], [2, 0], [0, 3]], 1, -0.3),
+    ],
+    ids=["nested balls", "a ball in another one", "tips", "few points left"],
+)
+def test_balls_in_others_and_cones_that_come_to_a_point(
+    nodes: Any, edges: Any, radii: int, level: float
+) -> None:
+    # Thin struts are kept beside large balls.
+    radius = ([0.9, 0.2, 0.2, 1e-3], [0.3, 0.1, 0.2, 0.35], [0.1, 0.5])[radii]
+    solid = hk.solids.struts(np.array(nodes, float), edges, radius)
+    mesh = hk.mesh(solid, level=level, tolerance=0.004)
+    assert mesh.is_watertight
+    values = solid.value(np.array(mesh.triangles_center), precision="double")
+    assert np.abs(values - level).max() < 0.004
+    low, high = np.array(solid.sublevel_extent(level).bounds())
+    if level == 0:
+        assert mesh.bounds == pytest.approx(np.array([low, high]), abs=0.004)
+    assert mesh.euler_number == 2
+    points = np.random.default_rng(0).uniform(low, high, (200_000, 3))
+    inside = float((solid.value(points, precision="double") < level).mean())
+    assert mesh.volume == pytest.approx(inside * np.prod(high - low), rel=0.03, abs=1e-3)

@@ -31,16 +31,15 @@ __all__ = ["strut_manifold"]
 _LEAST_AROUND = 6
 _MOST_VERTICES = 8_000_000
 # Lengths that differ by less than this fraction of them count as equal, and radii that differ by
-# less than this fraction of the longest edge.
+# less than this fraction of the longest edge or of the largest radius.
 _SAME = 1e-9
 # So many pairs of halves are compared at once, and at most so many in all.
 _PAIRS_AT_ONCE, _MOST_PAIRS = 500_000, 60_000_000
 
 
-def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold | None:
+def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold:
     """Make a mesh of the points where the function f of struts is at most `level`. Faces are within
-    `tolerance` (a length) of its surface, and cross sections of struts have the right area. None if
-    there is no such mesh, since a ball contains its neighbor or has no points left.
+    `tolerance` (a length) of its surface, and cross sections of struts have the right area.
 
     Proof of the tolerance. The radii are enlarged by a factor k, for the area, and vertices lie on
     the surfaces of the larger struts. Let r be the largest radius, s the smallest one, a the angle
@@ -57,17 +56,17 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold |
 
     edges = np.unique(np.sort(struts.edges, axis=1), axis=0)
     radii = struts.radii + level
-    if (radii[edges] <= 0).all():
+    edges = edges[(radii[edges] > 0).any(axis=1)]
+    nodes, edges, radii = _with_tips(struts.nodes, edges, radii)
+    if not len(edges):
         return Manifold()
     # Each ring needs more points than these, by which the number is found below.
     around = 2 * math.pi / math.sqrt(12 * tolerance / float(radii[edges].max()))
     _check_size(int(around), tolerance)
-    graph = _Graph.of(struts.nodes, edges, radii, tolerance)
-    if graph is None:
-        return None
+    graph = _Graph.of(nodes, edges, radii, tolerance)
     vertices_of_strut = graph.around * math.ceil(math.pi / graph.step)
     _check_size(vertices_of_strut, tolerance)
-    if _are_stars_apart(graph):
+    if graph.has_halves and _are_stars_apart(graph):
         surface = _joined_stars(graph)
         if surface is not None:
             return to_manifold(surface)
@@ -75,6 +74,23 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold |
     return Manifold.batch_boolean(
         [to_manifold(graph.strut_surface(k)) for k in range(len(edges))], OpType.Add
     )
+
+
+def _with_tips(
+    nodes: FloatArray, edges: IntArray, radii: FloatArray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Nodes, edges and radii in which no radius is negative: a cone whose radius comes to 0, or to
+    a tiny fraction of itself, ends at a node of its own there. Radii are linear along edges, so its
+    points are the same. Cones shorter than the rounding of nodes are left out."""
+    ends = radii[edges]
+    cut, side = np.nonzero(ends <= _SAME * ends.max(axis=1, keepdims=True))
+    other = edges[cut, 1 - side]
+    share = np.minimum(radii[other] / (radii[other] - ends[cut, side]), 1.0)
+    tips = nodes[other] + share[:, None] * (nodes[edges[cut, side]] - nodes[other])
+    edges = edges.copy()
+    edges[cut, side] = len(nodes) + np.arange(len(cut))
+    nodes, radii = np.concatenate([nodes, tips]), np.append(radii, np.zeros(len(cut)))
+    return nodes, edges[(nodes[edges[:, 0]] != nodes[edges[:, 1]]).any(axis=1)], radii
 
 
 def _check_size(vertices: int, tolerance: float) -> None:
@@ -100,6 +116,8 @@ class _Graph:
         which rings are made; opposite edges have the same.
     middle_radii: (m,) the radii of rings in the middle of edges.
     kinds: (2 m,) equal for halves of the same shape and direction.
+    has_halves: whether struts can be cut in halves: no ball reaches over the middle of an edge
+        beside the cone. Only whole struts may be taken otherwise.
     """
 
     nodes: FloatArray
@@ -112,16 +130,12 @@ class _Graph:
     middle_radii: FloatArray
     kinds: IntArray
     tolerance: float
+    has_halves: bool
 
     @classmethod
-    def of(
-        cls, nodes: FloatArray, edges: IntArray, radii: FloatArray, tolerance: float
-    ) -> _Graph | None:
-        """The graph of edges (m, 2) between nodes (n, 3), which have balls of radii (n,). None if a
-        ball reaches over the middle of an edge beside the cone, or has no points."""
+    def of(cls, nodes: FloatArray, edges: IntArray, radii: FloatArray, tolerance: float) -> _Graph:
+        """The graph of edges (m, 2) between nodes (n, 3), which have balls of radii (n,)."""
         ends = radii[edges]
-        if (ends <= 0).any():
-            return None
         largest, smallest = float(ends.max()), float(ends.min())
         around, step, factor = _resolution(tolerance / largest, smallest / largest)
         ends = factor * ends
@@ -131,18 +145,18 @@ class _Graph:
         # The cone touches the balls at circles, which must lie on their sides of the middle.
         is_plain = np.abs(slope) < 1
         is_plain &= np.abs(slope) * ends.max(axis=1) < 0.5 * length * (1 - _SAME)
-        if not is_plain.all():
-            return None
+        has_halves = bool(is_plain.all())
         # The line along the cone from one circle to the other; at the middle of the edge:
+        slope = slope.clip(-1, 1)
         cosine = np.sqrt((1 - slope) * (1 + slope))
         first, last = slope * ends[:, 0], length + slope * ends[:, 1]
-        share = (0.5 * length - first) / (last - first)
+        share = (0.5 * length - first) / np.where(is_plain, last - first, 1.0)
         middle_radii = cosine * (ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
-        # Directions and lengths, each to a fraction of itself: edges may be far shorter than others.
+        # Directions and lengths, each to a fraction of itself: some edges are far shorter.
         steps = np.rint(vector / length[:, None] / _SAME).astype(np.int64)
         longest = float(length.max())
         size = np.rint(np.log(length / longest) / _SAME).astype(np.int64)
-        thickness = np.rint(ends / (_SAME * longest)).astype(np.int64)
+        thickness = np.rint(ends / (_SAME * max(longest, float(ends.max())))).astype(np.int64)
         vectors = np.stack([vector, -vector], axis=1).reshape(-1, 3)
         # The shape of a half: its direction and length, and both radii.
         shape = np.stack(
@@ -155,7 +169,7 @@ class _Graph:
         kinds = np.unique(shape, axis=0, return_inverse=True)[1].reshape(-1)
         return cls(
             nodes, edges, around, step, ends.ravel(), vectors, _frames(steps), middle_radii,
-            kinds, tolerance,
+            kinds, tolerance, has_halves,
         )  # fmt: skip
 
     def ring(self, edge: int, radius: float) -> FloatArray:
@@ -175,6 +189,15 @@ class _Graph:
     def strut_surface(self, edge: int) -> TriangleMesh:
         """The closed surface of a whole strut."""
         (start, end), (first, last) = self.edges[edge], (2 * edge, 2 * edge + 1)
+        for half, node in ((first, start), (last, end)):
+            if self._slope(half) >= 1:  # the ball contains the other one
+                origin, vector, ball = self.nodes[node], self.vectors[half], self._ball_rings(half)
+                apex = self.radii[half] / np.linalg.norm(vector) * vector
+                turned = half == last
+                return _closed_surface(
+                    origin - apex, [origin + ring for ring in ball[:-1]], origin + apex,
+                    is_turned=turned,
+                )  # fmt: skip
         rings: list[list[FloatArray]] = []
         caps: list[FloatArray] = []
         for half, node in ((first, start), (last, end)):
@@ -183,14 +206,22 @@ class _Graph:
             caps.append(origin - self.radii[half] / np.linalg.norm(vector) * vector)
         return _closed_surface(caps[0], [*rings[0], *reversed(rings[1])], caps[1], is_turned=False)
 
+    def _slope(self, half: int) -> float:
+        """By how much the radius decreases from the node of a half to the other one, per length. At
+        most -1 or at least 1 if one ball contains the other."""
+        difference = float(self.radii[half] - self.radii[half ^ 1])
+        return difference / float(np.linalg.norm(self.vectors[half]))
+
     def _ball_rings(self, half: int) -> list[FloatArray]:
         """The rings on the ball of a half, relative to its node, from its end to the circle at
-        which the cone touches it."""
+        which the cone touches it; to the other end if the ball contains the other one."""
         vector, radius = self.vectors[half], float(self.radii[half])
+        if radius == 0:
+            return []
         length = float(np.linalg.norm(vector))
-        slope = (radius - float(self.radii[half ^ 1])) / length
+        slope = min(self._slope(half), 1.0)
         widest = math.acos(-slope)
-        count = max(1, math.ceil(widest / self.step))
+        count = max(1 if slope < 1 else 3, math.ceil(widest / self.step))
         angles = [widest * (k + 1) / count for k in range(count)]
         return [
             self.ring(half // 2, radius * math.sin(angle))
