@@ -298,3 +298,10 @@ def test_wrong_layers_are_refused(change: Any, error: Any, message: str) -> None
 def test_wrong_choices_are_refused(keywords: Any, error: Any, message: str) -> None:
     with pytest.raises(error, match=message):
         hk.Network(random_layers(0), **keywords)
+
+
+def test_weights_whose_squares_overflow_are_refused() -> None:
+    """Bounds would be infinite in single precision, and every ray a hit."""
+    layers = [(np.eye(3), np.zeros(3)), (np.full((1, 3), 1e20), np.zeros(1))]
+    with pytest.raises(ValueError, match="overflow in single precision: scale the network"):
+        hk.Network(layers, activation="softplus")

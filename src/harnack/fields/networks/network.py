@@ -114,6 +114,12 @@ class Network(Field):
         for entry in self._activations:
             bound *= entry.max_slope
         self.lipschitz = bound * (1 + 1e-9)
+        sizes = [float(np.abs(entries).max()) for layer in self.layers for entries in layer]
+        if not max(*sizes, self.lipschitz) <= _MOST:
+            raise ValueError(
+                f"the weights of this network, or their products, are above {_MOST:.0e}, the "
+                "squares of which overflow in single precision: scale the network"
+            )
         kinks = any(entry.kink(entry.parameter) != 0 for entry in self._activations)
         self.traits = Traits(over_relaxation=1.0, has_creases=kinks)
         make_read_only(self.layers)
@@ -314,6 +320,10 @@ def _layers_of_names(arrays: dict[str, Any], path: str) -> list[tuple[Any, Any]]
         return [int(digits) for digits in re.findall(r"\d+", name)]
 
     return [(layers[name]["weight"], layers[name]["bias"]) for name in sorted(layers, key=numbers)]
+
+
+# The largest weights, and the largest Lipschitz constant. Bounds are made of squares.
+_MOST = 1e17
 
 
 @dataclass(frozen=True, eq=False)
