@@ -253,7 +253,7 @@ def test_lost_rays_are_magenta_and_counted() -> None:
 
 
 VARIANT = """
-import mitsuba as mi, harnack as hk
+import harnack as hk, mitsuba as mi
 mi.set_variant("{variant}")
 from harnack.geometry.example_curves import wavy_polygon
 field = hk.SolidAngle(wavy_polygon(12))

@@ -271,16 +271,14 @@ class CsgMesher:
 
     def _mesh_ball(self, sphere: Sphere, level: float) -> Manifold:
         """Mesh the set {sphere <= level} as an operand: of a union of many spheres, level sets in
-        cells would take most of the time. The polyhedron has the volume of the ball, for which it
-        is enlarged by less than its faces are deep."""
+        cells would take most of the time. Vertices lie on the sphere, so that spheres that touch
+        from outside do not overlap."""
         from manifold3d import Manifold
 
         radius = sphere.radius + level
-        if radius <= 0:
-            return Manifold()
-        ball = ball_manifold(Ball((0.0, 0.0, 0.0), radius), self.tolerance)
-        factor = (4 / 3 * math.pi * radius**3 / ball.volume()) ** (1 / 3)
-        return ball.scale((factor,) * 3).translate(sphere.center)
+        return (
+            ball_manifold(Ball(sphere.center, radius), self.tolerance) if radius > 0 else Manifold()
+        )
 
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """Mesh the level set of `function` in the cells of `lattice`; returns a closed mesh.
