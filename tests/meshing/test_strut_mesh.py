@@ -18,7 +18,7 @@ FORK = np.array([[0.0, 0, 0], [2, 0, 0], [0.1, 2, 0.3], [-0.5, 0.2, 2]])
 
 def graph_of(solid: Struts) -> Any:
     edges = np.unique(np.sort(solid.edges, axis=1), axis=0)
-    return strut_mesh._Graph.of(solid.nodes, edges, solid.radii, TOLERANCE)
+    return strut_mesh._Graph.of(solid.nodes, edges, solid.radii, TOLERANCE, 10**6)
 
 
 def separate(solid: Struts) -> Any:
@@ -40,7 +40,7 @@ def separate(solid: Struts) -> Any:
 )
 def test_joined_stars_are_the_union_of_all_struts(solid: Struts) -> None:
     assert strut_mesh._are_stars_apart(graph_of(solid))
-    joined = strut_mesh.strut_manifold(solid, 0.0, TOLERANCE)
+    joined = strut_mesh.strut_manifold(solid, 0.0, TOLERANCE, 10**6)
     assert joined is not None
     expected = separate(solid)
     assert joined.volume() == pytest.approx(expected.volume(), rel=1e-9)
@@ -103,8 +103,11 @@ def test_meshes_of_single_struts() -> None:
 
 
 def test_an_enormous_mesh_of_struts_is_refused() -> None:
-    with pytest.raises(hk.MeshingError, match="struts within 1e-09 have more than"):
-        strut_mesh.strut_manifold(Struts.of([hk.Capsule((0, 0, 0), (1, 0, 0))]), 0.0, 1e-9)
+    capsule = hk.Capsule((0, 0, 0), (1, 0, 0))
+    with pytest.raises(hk.MeshingError, match="struts within 1e-09 take more than"):
+        strut_mesh.strut_manifold(Struts.of([capsule]), 0.0, 1e-9, 10**6)
+    with pytest.raises(hk.MeshingError, match="or raise `max_triangles`"):
+        hk.mesh(hk.lattice.cubic(1.0, 2).struts(0.1), max_triangles=500)
 
 
 @pytest.mark.parametrize("length", [1e-7, 1e-10, 1e-13])
@@ -116,7 +119,7 @@ def test_an_edge_far_shorter_than_others_has_a_direction(length: float) -> None:
 
 
 def test_a_tolerance_below_rounding_is_refused_at_once() -> None:
-    with pytest.raises(hk.MeshingError, match="struts within 5e-21 have more than"):
+    with pytest.raises(hk.MeshingError, match="struts within 5e-21 take more than"):
         hk.mesh(hk.Capsule((0, 0, 0), (1, 0, 0), 0.1), tolerance=1e-20)
 
 

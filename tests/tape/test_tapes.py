@@ -305,3 +305,43 @@ def test_another_model_of_the_same_kinds_compiles_nothing() -> None:
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     assert kernels
     assert all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
+
+
+def range_on_box(solid: hk.solids.FormulaSolid, lower: Any, upper: Any) -> tuple[float, float]:
+    """Of a solid that is a single instruction."""
+    tape = record(solid.formula)
+    operation = tape.operations[tape.kinds[tape.result]]
+    sides = [(lower[k : k + 1], upper[k : k + 1]) for k in range(3)]
+    low, high = operation.rounded_ranges(sides, list(tape.constants[tape.result][:, None]))
+    return float(low[0]), float(high[0])
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "distance"),
+    [
+        ((1.25, -3, 0), (1.25, 3, 0), 0.25),
+        ((2, 0.5, 0), (0.5, 2, 0), 0.5 / math.sqrt(2)),
+        ((4, 0, 0), (6, 0, 0), 3.0),
+    ],
+    ids=["beside a face", "askew to an edge", "beyond an end"],
+)
+def test_ranges_of_segments_are_sharp(start: Any, end: Any, distance: float) -> None:
+    """The nearest point of the box has this distance: larger bounds would be wrong."""
+    lower, upper = np.array([0.0, -1, -1]), np.array([1.0, 1, 1])
+    low, _ = range_on_box(hk.Capsule(start, end, 0.01), lower, upper)
+    assert distance - 0.01 - 1e-5 < low <= distance - 0.01
+
+
+def test_ranges_of_segments_and_cones_contain_all_values() -> None:
+    rng = np.random.default_rng(5)
+    share = np.stack(np.meshgrid(*[np.linspace(0, 1, 9)] * 3), axis=-1).reshape(-1, 3)
+    for _ in range(60):
+        center, half = rng.normal(size=3), rng.uniform(0.01, 1.5, 3)
+        lower, upper = center - half, center + half
+        start, end = (tuple(point) for point in rng.normal(size=(2, 3)).tolist())
+        points = lower + share * (upper - lower)
+        for solid in (hk.Capsule(start, end, 0.1), hk.solids.RoundCone(start, end, (0.3, 0.1))):
+            low, high = range_on_box(solid, lower, upper)
+            values = solid.value(points, precision="double")
+            assert low <= values.min()
+            assert values.max() <= high

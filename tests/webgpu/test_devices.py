@@ -84,8 +84,8 @@ FEWER = {"network": 4_000}
 @pytest.mark.few(6)
 @pytest.mark.parametrize("name", [
     *(first := ("gyroid", "wavy", "mesh, exact", "torus", "polygon mesh", "log")),
-    *(one for one in [*FIELDS, *APPROXIMATE, *SHAPES, *OTHERS]
-      if one not in (*first, *TOO_LONG)),
+    *(name for name in [*FIELDS, *APPROXIMATE, *SHAPES, *OTHERS]
+      if name not in (*first, *TOO_LONG)),
 ])  # fmt: skip
 def test_every_field_is_hit_as_on_the_cpu(name: str) -> None:
     check_same_hits(field_of(name), FEWER.get(name, 20_000))
@@ -100,14 +100,14 @@ def check_same_results(compute: Callable[..., dict[str, Any]], count: int = 50) 
     }
     recording = record_kernel(compute, lanes, ())
     program = find_device().compile(recording.shader)
-    found = program.run(recording.data, {f"lane {k}": to_numpy(v) for k, v in lanes.items()})
+    computed = program.run(recording.data, {f"lane {k}": to_numpy(v) for k, v in lanes.items()})
     assert recording.results
     for label, result in recording.results.items():
         expected = to_numpy(result)
         if expected.dtype == np.bool_:
-            np.testing.assert_array_equal(found[label] != 0, expected)
+            np.testing.assert_array_equal(computed[label] != 0, expected)
         else:
-            np.testing.assert_allclose(found[label].view(expected.dtype), expected, rtol=1e-5)
+            np.testing.assert_allclose(computed[label].view(expected.dtype), expected, rtol=1e-5)
 
 
 def test_switches() -> None:
@@ -132,8 +132,8 @@ def test_switches() -> None:
 
         state = (backend.UInt32(n), x, n, x > 1)
         _, x, n, is_large = dr.while_loop(state, lambda k, *_: k < 7, body)
-        (one,) = dr.switch(n * 0, [lambda x: (x + 1,)], x)
-        return {"x": one, "n": n, "large": is_large}
+        (increased,) = dr.switch(n * 0, [lambda x: (x + 1,)], x)
+        return {"x": increased, "n": n, "large": is_large}
 
     check_same_results(compute)
 
@@ -261,8 +261,8 @@ def test_tables_are_uploaded_once_for_all_dispatches(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(device_module, "_INITIAL_BATCH", 64)
     monkeypatch.setattr(device_module, "_MAX_BATCH", 64)
     program = Device(uploads, "device").compile(recording.shader)
-    found = program.run(recording.data, {"lane x": to_numpy(x)})
+    computed = program.run(recording.data, {"lane x": to_numpy(x)})
     expected = to_numpy(recording.results["result y"])
-    assert np.array_equal(found["result y"].view(np.float32), expected)
+    assert np.array_equal(computed["result y"].view(np.float32), expected)
     assert len([size for size in uploads.sizes if size > 4 * 4096]) == 1
     assert len(uploads.sizes) == 1 + 10

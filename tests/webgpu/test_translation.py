@@ -167,7 +167,7 @@ l_7_next:
     _, _, branch, _ = kernel.statements
     assert isinstance(branch, Branch)
     assert branch.condition == "%p3"
-    assert [(one.name, one.value) for one in branch.results] == [("%f2", "%f4")]
+    assert [(result.name, result.value) for result in branch.results] == [("%f2", "%f4")]
     code = to_shader(kernel).code
     assert "if (v_p3) {\n    let v_f4 = -v_f1;\n    v_f2 = v_f4;\n  }" in code
 

@@ -271,14 +271,19 @@ class CsgMesher:
 
     def _mesh_ball(self, sphere: Sphere, level: float) -> Manifold:
         """Mesh the set {sphere <= level} as an operand: of a union of many spheres, level sets in
-        cells would take most of the time. Vertices lie on the sphere, so that spheres that touch
-        from outside do not overlap."""
+        cells would take most of the time. A sphere that is meshed alone has cells, and so the size
+        of triangles that was asked for. Vertices lie on the sphere, so that spheres that touch from
+        outside do not overlap."""
         from manifold3d import Manifold
 
         radius = sphere.radius + level
         return (
             ball_manifold(Ball(sphere.center, radius), self.tolerance) if radius > 0 else Manifold()
         )
+
+    def _mesh_struts(self, struts: Struts, level: float) -> Manifold:
+        """Mesh the set {struts <= level}."""
+        return strut_manifold(struts, level, self.tolerance, self.most_faces)
 
     def _mesh_level_set(self, function: LevelFunction, lattice: BccLattice) -> TriangleMesh:
         """Mesh the level set of `function` in the cells of `lattice`; returns a closed mesh.
@@ -539,13 +544,9 @@ class CsgMesher:
         TransformedSolid: _mesh_transformed,
         Cuboid: _mesh_box,
         Cylinder: lambda self, solid, level: cylinder_manifold(solid, level, self.tolerance),
-        Capsule: lambda self, solid, level: strut_manifold(
-            Struts.of([solid]), level, self.tolerance
-        ),
-        RoundCone: lambda self, solid, level: strut_manifold(
-            Struts.of([solid]), level, self.tolerance
-        ),
-        Struts: lambda self, solid, level: strut_manifold(solid, level, self.tolerance),
+        Capsule: lambda self, solid, level: self._mesh_struts(Struts.of([solid]), level),
+        RoundCone: lambda self, solid, level: self._mesh_struts(Struts.of([solid]), level),
+        Struts: _mesh_struts,
         Extrusion: lambda self, solid, level: (
             extruded_manifold(solid.loops, solid.height, solid.twist, solid.taper, self.tolerance)
             if level == 0

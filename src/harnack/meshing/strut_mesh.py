@@ -16,7 +16,7 @@ import numpy as np
 from harnack.geometry.mesh_edges import row_norms
 from harnack.geometry.neighborhoods import kd_tree
 from harnack.meshing.closed_mesh import from_manifold, polygon_factor, to_manifold
-from harnack.meshing.meshing_errors import MeshingError
+from harnack.meshing.meshing_errors import TriangleLimitError
 from harnack.meshing.triangle_mesh import TriangleMesh
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ __all__ = ["strut_manifold"]
 
 # The smallest number of points around, also for struts far thinner than the tolerance.
 _LEAST_AROUND = 6
-_MOST_VERTICES = 8_000_000
 # Lengths that differ by less than this fraction of them count as equal, and radii that differ by
 # less than this fraction of the longest edge or of the largest radius.
 _SAME = 1e-9
@@ -37,7 +36,7 @@ _SAME = 1e-9
 _PAIRS_AT_ONCE, _MOST_PAIRS = 500_000, 60_000_000
 
 
-def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold:
+def strut_manifold(struts: Struts, level: float, tolerance: float, most_faces: int) -> Manifold:
     """Make a mesh of the points where the function f of struts is at most `level`. Faces are within
     `tolerance` (a length) of its surface, and cross sections of struts have the right area.
 
@@ -49,8 +48,10 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold:
     the meshes contains the points where f is less than the smaller bound, since one of the struts'
     meshes contains them, and no point where f is larger than the other.
 
+    most_faces: the largest number of triangles, before coplanar ones are merged.
+
     Raises:
-        MeshingError: the mesh would have millions of faces.
+        TriangleLimitError: there would be more triangles.
     """
     from manifold3d import Manifold, OpType
 
@@ -62,15 +63,15 @@ def strut_manifold(struts: Struts, level: float, tolerance: float) -> Manifold:
         return Manifold()
     # Each ring needs more points than these, by which the number is found below.
     around = 2 * math.pi / math.sqrt(12 * tolerance / float(radii[edges].max()))
-    _check_size(int(around), tolerance)
-    graph = _Graph.of(nodes, edges, radii, tolerance)
+    _check_size(int(around), tolerance, most_faces)
+    graph = _Graph.of(nodes, edges, radii, tolerance, most_faces)
     vertices_of_strut = graph.around * math.ceil(math.pi / graph.step)
-    _check_size(vertices_of_strut, tolerance)
+    _check_size(vertices_of_strut, tolerance, most_faces)
     if graph.has_halves and _are_stars_apart(graph):
         surface = _joined_stars(graph)
         if surface is not None:
             return to_manifold(surface)
-    _check_size(len(edges) * vertices_of_strut, tolerance)
+    _check_size(len(edges) * vertices_of_strut, tolerance, most_faces)
     return Manifold.batch_boolean(
         [to_manifold(graph.strut_surface(k)) for k in range(len(edges))], OpType.Add
     )
@@ -93,12 +94,13 @@ def _with_tips(
     return nodes, edges[(nodes[edges[:, 0]] != nodes[edges[:, 1]]).any(axis=1)], radii
 
 
-def _check_size(vertices: int, tolerance: float) -> None:
-    """Raise MeshingError if a mesh has too many vertices."""
-    if vertices > _MOST_VERTICES:
-        raise MeshingError(
-            f"struts within {tolerance:.3g} have more than {2 * vertices:,} faces: choose a larger "
-            "`tolerance`"
+def _check_size(vertices: int, tolerance: float, most_faces: int) -> None:
+    """Raise TriangleLimitError if a closed mesh with so many vertices has too many faces."""
+    if 2 * vertices > most_faces:
+        raise TriangleLimitError(
+            f"struts within {tolerance:.3g} take more than {2 * vertices:,} triangles before they "
+            f"are simplified, and {most_faces:,} are allowed: choose a larger `tolerance`, or "
+            "raise `max_triangles`"
         )
 
 
@@ -116,6 +118,7 @@ class _Graph:
         which rings are made; opposite edges have the same.
     middle_radii: (m,) the radii of rings in the middle of edges.
     kinds: (2 m,) equal for halves of the same shape and direction.
+    tolerance, most_faces: the arguments of `strut_manifold`.
     has_halves: whether struts can be cut in halves: no ball reaches over the middle of an edge
         beside the cone. Only whole struts may be taken otherwise.
     """
@@ -130,10 +133,18 @@ class _Graph:
     middle_radii: FloatArray
     kinds: IntArray
     tolerance: float
+    most_faces: int
     has_halves: bool
 
     @classmethod
-    def of(cls, nodes: FloatArray, edges: IntArray, radii: FloatArray, tolerance: float) -> _Graph:
+    def of(
+        cls,
+        nodes: FloatArray,
+        edges: IntArray,
+        radii: FloatArray,
+        tolerance: float,
+        most_faces: int,
+    ) -> _Graph:
         """The graph of edges (m, 2) between nodes (n, 3), which have balls of radii (n,)."""
         ends = radii[edges]
         largest, smallest = float(ends.max()), float(ends.min())
@@ -169,7 +180,7 @@ class _Graph:
         kinds = np.unique(shape, axis=0, return_inverse=True)[1].reshape(-1)
         return cls(
             nodes, edges, around, step, ends.ravel(), vectors, _frames(steps), middle_radii,
-            kinds, tolerance, has_halves,
+            kinds, tolerance, most_faces, has_halves,
         )  # fmt: skip
 
     def ring(self, edge: int, radius: float) -> FloatArray:
@@ -193,10 +204,9 @@ class _Graph:
             if self._slope(half) >= 1:  # the ball contains the other one
                 origin, vector, ball = self.nodes[node], self.vectors[half], self._ball_rings(half)
                 apex = self.radii[half] / np.linalg.norm(vector) * vector
-                turned = half == last
                 return _closed_surface(
                     origin - apex, [origin + ring for ring in ball[:-1]], origin + apex,
-                    is_turned=turned,
+                    is_turned=half == last,
                 )  # fmt: skip
         rings: list[list[FloatArray]] = []
         caps: list[FloatArray] = []
@@ -411,19 +421,20 @@ def _joined_stars(graph: _Graph) -> TriangleMesh | None:
     vertices: list[FloatArray] = [rings.reshape(-1, 3)]
     faces: list[IntArray] = []
     count = len(vertices[0])
-    for same in stars.values():
-        star = _Star.of(graph, same[0])
+    for halves_of_stars in stars.values():
+        star = _Star.of(graph, halves_of_stars[0])
         if star is None:
             return None
-        halves = np.stack(same)
-        own = np.setdiff1d(np.arange(len(star.vertices)), star.rings)
-        index = np.empty((len(same), len(star.vertices)), np.int64)
-        index[:, own] = count + np.arange(len(same) * len(own)).reshape(len(same), -1)
+        halves = np.stack(halves_of_stars)
+        # Of each star the vertices that are in no ring.
+        inner = np.setdiff1d(np.arange(len(star.vertices)), star.rings)
+        index = np.empty((len(halves), len(star.vertices)), np.int64)
+        index[:, inner] = count + np.arange(len(halves) * len(inner)).reshape(len(halves), -1)
         points = np.arange(graph.around)
         index[:, star.rings] = halves[:, :, None] // 2 * graph.around + points
         origin = graph.nodes[nodes[halves[:, 0]]]
-        vertices.append((origin[:, None] + star.vertices[own]).reshape(-1, 3))
+        vertices.append((origin[:, None] + star.vertices[inner]).reshape(-1, 3))
         faces.append(index[:, star.faces].reshape(-1, 3))
         count += len(vertices[-1])
-        _check_size(count, graph.tolerance)
+        _check_size(count, graph.tolerance, graph.most_faces)
     return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))

@@ -75,7 +75,8 @@ class TapeCells(GridData):
         depth = round(3.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
         depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
         if all(operation.choice is None for operation in tape.operations):
-            depth = min(depth, _DEPTH_OF_WHOLE_LISTS)  # nothing is left out: cells are only empty
+            # Nothing is ever left out of a list, so that cells only tell where no level is.
+            depth = min(depth, _DEPTH_OF_WHOLE_LISTS)
         reach = float(np.abs([lower, upper]).max())
         longest = float((upper - lower).max()) * (1 + _BORDER)
         while depth > 0 and longest / 2**depth < _MIN_CELL * reach:
@@ -149,7 +150,8 @@ class _Octree:
         # A list of one instruction is not made shorter, so that only fewer empty cells would be
         # told apart: for that the smallest cells cost too much.
         is_divided = [
-            ~self._is_empty(part) & (rest > (part.lists.lengths <= 1)) for part in results
+            ~self._is_empty(part) & (rest > 0) & ((rest > 1) | (part.lists.lengths > 1))
+            for part in results
         ]
         octant_count = 8 * sum(int(divided.sum()) for divided in is_divided)
         entry_count = sum(

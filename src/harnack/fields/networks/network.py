@@ -51,6 +51,10 @@ _MIN_RAYS, _MAX_WEIGHTS = 2048, 20_000
 # Lengths on rays are taken between these: beyond are only rays without an end.
 _SHORTEST, _LONGEST = 1e-30, 1e15
 
+# The largest weight and Lipschitz constant: the squares of which bounds are made must not overflow
+# in single precision.
+_MAX_WEIGHT = 1e17
+
 _GRIDS: FieldCache[dict[Any, Any]] = FieldCache()
 
 
@@ -115,9 +119,9 @@ class Network(Field):
             bound *= entry.max_slope
         self.lipschitz = bound * (1 + 1e-9)
         sizes = [float(np.abs(entries).max()) for layer in self.layers for entries in layer]
-        if not max(*sizes, self.lipschitz) <= _MOST:
+        if not max(*sizes, self.lipschitz) <= _MAX_WEIGHT:  # it may be NaN
             raise ValueError(
-                f"the weights of this network, or their products, are above {_MOST:.0e}, the "
+                f"the weights of this network, or their products, are above {_MAX_WEIGHT:.0e}, the "
                 "squares of which overflow in single precision: scale the network"
             )
         kinks = any(entry.kink(entry.parameter) != 0 for entry in self._activations)
@@ -320,10 +324,6 @@ def _layers_of_names(arrays: dict[str, Any], path: str) -> list[tuple[Any, Any]]
         return [int(digits) for digits in re.findall(r"\d+", name)]
 
     return [(layers[name]["weight"], layers[name]["bias"]) for name in sorted(layers, key=numbers)]
-
-
-# The largest weights, and the largest Lipschitz constant. Bounds are made of squares.
-_MOST = 1e17
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,17 +14,13 @@ import numpy as np
 from harnack.backend import choose_backend, to_vector3
 from harnack.backend.validation import (
     as_positive,
-    as_real_array,
     as_triple,
-    check_coordinate_size,
-    check_finite,
-    check_vectors,
     no_derivatives,
 )
 from harnack.fields.solids.patterns import checked_counts
 from harnack.fields.solids.solid import Solid
 from harnack.fields.solids.struts import struts
-from harnack.fields.solids.tube import checked_pairs
+from harnack.fields.solids.tube import checked_pairs, checked_points
 from harnack.geometry import Volume
 
 if TYPE_CHECKING:
@@ -58,12 +54,7 @@ class Lattice:
 
     def __post_init__(self) -> None:
         """Check the arrays, and make them read-only."""
-        array = as_real_array(self.nodes, "the nodes of a lattice")
-        check_vectors(array, "the nodes of a lattice")
-        nodes: FloatArray = np.array(array, dtype=np.float64)
-        check_finite(nodes, "node {} of a lattice", ValueError)
-        check_coordinate_size(nodes, ValueError)
-        nodes.setflags(write=False)
+        nodes = checked_points(self.nodes, ("node", "a lattice"))
         object.__setattr__(self, "nodes", nodes)
         edges = checked_pairs(self.edges, nodes, ("edge", "node", "a lattice"))
         object.__setattr__(self, "edges", edges)

@@ -12,18 +12,12 @@ import numpy as np
 from harnack.arithmetic import cone_distance, minimum, segment_distance
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend import FloatArray, IntArray
-from harnack.backend.validation import (
-    as_real_array,
-    check_coordinate_size,
-    check_finite,
-    check_vectors,
-    no_derivatives,
-)
+from harnack.backend.validation import no_derivatives
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.solids.booleans import smooth_union
 from harnack.fields.solids.round_cones import Capsule, RoundCone, axial_frames, cone_numbers
 from harnack.fields.solids.solid import FormulaSolid, box_around, set_frozen
-from harnack.fields.solids.tube import checked_pairs, checked_radii
+from harnack.fields.solids.tube import checked_pairs, checked_points, checked_radii
 from harnack.fields.tape_evaluator import tape_evaluator
 
 if TYPE_CHECKING:
@@ -56,11 +50,7 @@ class Struts(FormulaSolid):
 
     def __post_init__(self) -> None:
         """Check the arrays, and make them read-only."""
-        array = as_real_array(self.nodes, "the nodes of struts")
-        check_vectors(array, "the nodes of struts")
-        nodes: FloatArray = np.array(array, dtype=np.float64)
-        check_finite(nodes, "node {} of struts", ValueError)
-        check_coordinate_size(nodes, ValueError)
+        nodes = checked_points(self.nodes, ("node", "struts"))
         edges = checked_pairs(self.edges, nodes, ("edge", "node", "struts"))
         radii = checked_radii(self.radii, len(nodes), ("node", "struts"))
         for name, entries in (("nodes", nodes), ("edges", edges), ("radii", radii)):

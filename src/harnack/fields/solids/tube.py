@@ -603,11 +603,7 @@ class TubeNetwork(PatchField):
 
     def __init__(self, points: Any, segments: Any, radius: Any) -> None:
         """Check points, segments and radius (see the class), and store them as NumPy arrays."""
-        array = as_real_array(points, "the points of tubes")
-        check_vectors(array, "the points of tubes")
-        self.points: FloatArray = np.array(array, dtype=np.float64)
-        check_finite(self.points, "point {} of tubes", ValueError)
-        check_coordinate_size(self.points, ValueError)
+        self.points: FloatArray = checked_points(points)
         self.segments: IntArray = checked_pairs(segments, self.points)
         if len(self.segments) >= MAX_BOXES:
             raise ValueError(f"{len(self.segments):,} segments are too many: at most {MAX_BOXES:,}")
@@ -717,6 +713,24 @@ class _SegmentEvaluator(Evaluator):
             TaylorRemainder(1 / taylor_radius, taylor_radius),
         )
         return Sample(distance - row[3], gradient, promises, error, gradient_error)
+
+
+def checked_points(points: Any, names: tuple[str, str] = ("point", "tubes")) -> FloatArray:
+    """Check points, and return them as a read-only array (n, 3).
+
+    names: what a point and the whole are called in messages.
+
+    Raises:
+        ValueError: a wrong shape, or coordinates that are not finite or too large.
+    """
+    point, whole = names
+    array = as_real_array(points, f"the {point}s of {whole}")
+    check_vectors(array, f"the {point}s of {whole}")
+    result: FloatArray = np.array(array, dtype=np.float64)
+    check_finite(result, f"{point} {{}} of {whole}", ValueError)
+    check_coordinate_size(result, ValueError)
+    result.setflags(write=False)
+    return result
 
 
 def checked_pairs(
