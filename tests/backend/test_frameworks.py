@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ jax: Any = pytest.importorskip("jax", reason="make test-frameworks installs JAX"
 
 import harnack as hk  # noqa: E402
 from harnack.backend import Precision, choose_backend, to_numpy, to_vector3  # noqa: E402
+from harnack.backend.llvm import best_library  # noqa: E402
 from harnack.geometry import example_curves  # noqa: E402
 from tests.backend.test_kernels import compiled  # noqa: E402
 from tests.project.test_readme import ROOT, blocks_of, run_code  # noqa: E402
@@ -304,7 +306,11 @@ def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     "order", ["torch, jax, harnack", "harnack, jax, torch", "drjit, torch, jax"]
 )
 def test_any_order_of_imports(order: str) -> None:
-    """Each brings an LLVM or an OpenMP of its own."""
+    """Each brings an LLVM or an OpenMP of its own.
+
+    Dr.Jit imported first loads the system's LLVM, which may be unsuitable: the variable names
+    another, as the error's text says (`test_backend` has the error).
+    """
     code = f"""
 import {order}
 import harnack as hk, jax, numpy as np, torch
@@ -319,7 +325,11 @@ first = lambda *arrays: hk.io.wrap_for_jax(value)(*arrays)[0]
 gradient = jax.grad(first)(np.float32(loop), np.float32(p))
 np.testing.assert_allclose(v.grad.numpy(), gradient, atol=1e-5)
 """
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    library = best_library()
+    named = {"DRJIT_LIBLLVM_PATH": str(library.path)} if library is not None else {}
+    environment = os.environ | named if order.startswith("drjit") else None
+    command = [sys.executable, "-c", code]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert run.returncode == 0, run.stderr
 
 
