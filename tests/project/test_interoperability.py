@@ -103,7 +103,7 @@ def check_grooved_ball(vertices: Any, faces: Any) -> None:
     from_center, from_circle = distances_of_grooved_ball(mesh.vertices)
     assert from_center.max() < 1 + 1e-5
     away = np.minimum(np.abs(from_center - 1), np.abs(from_circle - 0.3))
-    assert away.max() < 2e-3  # The tolerance is 1e-2.
+    assert away.max() < 5e-3  # The tolerance is 1e-2.
 
 
 def distances_of_grooved_ball(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
