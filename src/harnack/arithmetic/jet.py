@@ -168,6 +168,11 @@ class Jet(FormulaNumber):
             dataclasses.replace(jet, roots=self.roots + other.roots) if is_sum_of_squares else jet
         )
 
+    def moved(self, by: Interval) -> Jet:
+        """The sum of this function and a constant that lies in an interval."""
+        start = None if self.jet_at_start is None else self.jet_at_start.moved(by)
+        return dataclasses.replace(self, value=self.value + by, jet_at_start=start, roots=())
+
     def __neg__(self) -> Jet:
         """The function times -1."""
         return dataclasses.replace(

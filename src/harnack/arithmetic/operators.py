@@ -113,6 +113,17 @@ class FormulaNumber(abc.ABC):
         del name, values, literals
         return None
 
+    def least_of_rows(self, name: str, point: Sequence[Any], rows: FloatArray) -> Self | None:
+        """The least of many functions of a point, as a single step of this arithmetic; None, the
+        default, if they are to be computed one by one.
+
+        name: "capsule" or "round cone" (`harnack.tape.operations`).
+        point: (3,) the coordinates.
+        rows: (n, c) the constants of each function.
+        """
+        del name, point, rows
+        return None
+
     def constant_between(self, lower: Real, upper: Real) -> Self:
         """A constant that lies between two numbers of the backend.
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
+from harnack.arithmetic.distance_jets import jet_of_segment_distance
 from harnack.arithmetic.norms import as_one_operation, maximum, minimum, norm
 
 __all__ = ["Frame", "cone_distance", "segment_distance"]
@@ -29,6 +30,8 @@ def segment_distance(point: Sequence[Any], frame: Sequence[Any], half_length: An
     of a convex function that is not negative, with which it grows.
     """
     whole = as_one_operation("segment distance", tuple(point), *frame, half_length)
+    if whole is None:
+        whole = jet_of_segment_distance(point, frame, half_length)
     if whole is not None:
         return whole
     along, across, other = _local_coordinates(point, frame)

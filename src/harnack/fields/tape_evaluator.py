@@ -82,7 +82,7 @@ def tape_evaluator(
     if shortest is None:
         is_single = hasattr(cast("Any", type(field)), "tally")
         shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
-    if tape is None or (len(tape) <= shortest and tape.call_count <= _MAX_OPERATIONS):
+    if tape is None or (tape.operation_count <= shortest and tape.call_count <= _MAX_OPERATIONS):
         return None
     uploaded: _UploadedTape = _upload(field, backend, plan.levels)
     lipschitz = getattr(field, "lipschitz", None)

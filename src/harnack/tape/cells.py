@@ -4,13 +4,12 @@ one list."""
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harnack.tape.pruning import BoxLimits, BoxTapes, PrunedTapes
+from harnack.tape.pruning import OCTANTS, BoxLimits, BoxTapes, PrunedTapes
 from harnack.tree.empty_space import GridData, distance_to_occupied, round_to_short_float
 
 if TYPE_CHECKING:
@@ -38,7 +37,6 @@ _COARSER = 2
 _MAX_OCTANTS, _MAX_ENTRIES = 1_000_000, 24_000_000
 # The number of entries that are treated at once, so that they stay in the processor's cache.
 _ENTRIES_AT_ONCE = 400_000
-_OCTANTS = np.array(list(itertools.product((0, 1), repeat=3)))
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ class TapeCells(GridData):
         Proof that a cell is empty: the range of the formula on the enlarged cell does not contain a
         level.
         """
-        depth = round(3.5 + np.log2(len(tape)) / 3) - (0 if levels else _COARSER)
+        depth = round(3.5 + np.log2(tape.operation_count) / 3) - (0 if levels else _COARSER)
         depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
         if all(operation.choice is None for operation in tape.operations):
             # Nothing is ever left out of a list, so that cells only tell where no level is.
@@ -163,11 +161,14 @@ class _Octree:
         for part, divided, cells in zip(results, is_divided, batches, strict=True):
             divided &= not is_last
             leaves, inner = np.flatnonzero(~divided), np.flatnonzero(divided)
-            self.parts.append(_subset(part, leaves))
+            self.parts.append(part.subset(leaves))
             self.leaves.append((indices[cells][leaves], rest, self._is_empty(self.parts[-1])))
-            children = np.repeat(inner, 8)
-            places = (2 * indices[cells][inner][:, None] + _OCTANTS).reshape(-1, 3)
-            octants.append((part.lists.subset(children), places, part.limits.subset(children)))
+            children, corners = np.tile(inner, 8), indices[cells][inner]
+            places = (2 * corners + OCTANTS[:, None]).reshape(-1, 3)
+            middles = self._origin + self._size * 2**rest * (corners + 0.5)
+            margin = self._size * CELL_MARGIN * (1 + 1e-6)
+            of_octants = part.subset(inner).octants(middles, margin)
+            octants.append((of_octants, places, part.limits.subset(children)))
         return (
             BoxTapes.concatenated([entry[0] for entry in octants]),
             np.concatenate([entry[1] for entry in octants]),
@@ -214,13 +215,6 @@ class _Octree:
                 blocks[z, y, x] = values[:, None, None, None]
             first += len(indices)
         return list_of_cell, is_empty
-
-
-def _subset(part: PrunedTapes, which: IntArray) -> PrunedTapes:
-    """The lists of the boxes with these indices."""
-    return PrunedTapes(
-        part.lists.subset(which), part.low[which], part.high[which], part.limits.subset(which)
-    )
 
 
 def _batches(lengths: IntArray) -> list[IntArray]:

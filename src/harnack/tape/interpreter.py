@@ -7,6 +7,7 @@ nothing."""
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, cast
@@ -34,8 +35,9 @@ __all__ = ["TapeFormula", "TapeProgram", "rounded_ends"]
 _WORDS, _SLOT_BITS = 4, 16
 _MAX_SLOTS = 1 << _SLOT_BITS
 # Flags: whether an operand is read from local memory; whether it is the first or the second operand
-# (otherwise that is the result of the instruction before); and whether the result is written there.
-_READS, _FIRST, _SECOND, _WRITES = 1, 2, 4, 8
+# (otherwise that is the result of the instruction before); whether the result is written there; and
+# whether it is the first member of a chain without an operand, for which infinity stands.
+_READS, _FIRST, _SECOND, _WRITES, _BEGINS = 1, 2, 4, 8, 16
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,8 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     kinds: Any = tape.kinds[instructions]
     arities = np.array([0 if o.is_of_point else o.operand_count for o in tape.operations])
     arity = np.where(kinds >= 0, arities[kinds], 0)
+    begins: Any = (tape.chains[instructions] >= 0) & (lists.operands[0] == entries)
+    arity = np.where(begins, 0, arity)
     is_run = kinds >= 0
     # Whether an operand is the result of the entry before, which is in the same list.
     is_before: list[BoolArray] = [
@@ -141,7 +145,11 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
     is_written[loaded[loads]] = True
     row_of = np.cumsum(_rows_of_constants(tape)) - 1
     flags: Any = (
-        _READS * reads + _FIRST * reads_first + _SECOND * reads_second + _WRITES * is_written
+        _READS * reads
+        + _FIRST * reads_first
+        + _SECOND * reads_second
+        + _WRITES * is_written
+        + _BEGINS * begins
     )
     own: Any = np.stack(
         [
@@ -217,6 +225,12 @@ class TapeFormula:
         calls = [self._call(operation, layouts, unpack) for operation in program.operations]
         calls.append(_first)
         has_third = any(o.operand_count > 2 and not o.is_of_point for o in program.operations)
+        has_chains = any(o.is_member for o in program.operations)
+        infinite = [
+            part
+            for j, layout in enumerate(layouts)
+            for part in layout.parts(numbers[COORDINATE_COUNT * j].constant(math.inf), zero)
+        ]
         mask = (1 << _SLOT_BITS) - 1
         word_type = dr.uint32_array_t(backend.Array4f)
 
@@ -225,16 +239,19 @@ class TapeFormula:
             words = dr.gather(word_type, program.words, k)
             flags, slot = words[3], words[1] & mask
             reads = (flags & _READS) != 0
-            read = [slots.read(slot, reads) for slots in memory]
+            read = dr.if_stmt((slot, memory, last), reads, _read_all, _keep_last)
             is_first, is_second = (flags & _FIRST) != 0, (flags & _SECOND) != 0
             first = [dr.select(is_first, a, b) for a, b in zip(read, last, strict=True)]
             second = [dr.select(is_second, a, b) for a, b in zip(read, last, strict=True)]
+            if has_chains:
+                begins = (flags & _BEGINS) != 0
+                first = [dr.select(begins, a, b) for a, b in zip(infinite, first, strict=True)]
             third = [slots.read(words[1] >> _SLOT_BITS, reads) for slots in memory if has_third]
             constants = program.constants.read_record(words[2])
             parts = dr.switch(words[0] & mask, calls, first, second, third, constants, packed)
             is_written = (flags & _WRITES) != 0
-            for slots, part in zip(memory, parts, strict=True):
-                slots.write(part, words[0] >> _SLOT_BITS, is_written)
+            slot = words[0] >> _SLOT_BITS
+            memory = dr.if_stmt((slot, memory, parts), is_written, _write_all, _keep_memory)
             return k + 1, parts, memory
 
         start = self.begin + backend.UInt32(0 * zero)
@@ -284,6 +301,7 @@ class TapeFormula:
                 else:
                     entries = (first, second, third)[: operation.operand_count]
                     operands = [layout.number(entry[start:end], point[0]) for entry in entries]
+                    operands += point if operation.is_member else []
                 bounds = self._constants(operation, constants, point[0])
                 value = operation.apply(operands, bounds)
                 parts.extend(layout.parts(value, 0 * packed[0]))
@@ -301,6 +319,31 @@ class TapeFormula:
         width = self.program.constant_count
         high = constants[width : width + operation.constant_count]
         return [like.constant_between(*ends) for ends in zip(low, high, strict=True)]
+
+
+def _read_all(slot: Any, memory: list[Any], last: list[Real]) -> list[Real]:
+    """The parts of a result in local memory. (A packet of lanes none of which reads skips this.)"""
+    del last
+    return [slots.read(slot) for slots in memory]
+
+
+def _keep_last(slot: Any, memory: list[Any], last: list[Real]) -> list[Real]:
+    """The parts of the result of the instruction before."""
+    del slot, memory
+    return last
+
+
+def _write_all(slot: Any, memory: list[Any], parts: list[Real]) -> list[Any]:
+    """Write the parts of a result into local memory."""
+    for slots, part in zip(memory, parts, strict=True):
+        slots.write(part, slot)
+    return memory
+
+
+def _keep_memory(slot: Any, memory: list[Any], parts: list[Real]) -> list[Any]:
+    """Leave local memory as it is."""
+    del slot, parts
+    return memory
 
 
 def _first(first: list[Real], *_: Any) -> list[Real]:

@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from harnack.arithmetic import (
+    Jet,
     atan2,
     blend_intersection,
     blend_union,
@@ -30,6 +31,7 @@ from harnack.arithmetic import (
     orthogonal_intersection,
     segment_distance,
 )
+from harnack.arithmetic.distance_jets import jet_of_point_distance
 from harnack.arithmetic.functions import ElementaryFunction, reciprocal
 from harnack.backend import FloatArray, IntArray
 
@@ -37,6 +39,7 @@ __all__ = [
     "COORDINATE_COUNT",
     "Operation",
     "blend_operation",
+    "chain_operation",
     "function_operation",
     "norm_operation",
     "operation_named",
@@ -50,6 +53,9 @@ RangeFunction: TypeAlias = "Callable[[Sequence[Range], Sequence[FloatArray]], Ra
 ChoiceFunction: TypeAlias = "Callable[[Sequence[Range], Sequence[FloatArray], Range], IntArray]"
 # Takes the constants and the limits of the result, and returns the limits of the operands.
 LimitFunction: TypeAlias = "Callable[[Sequence[FloatArray], Range], Range]"
+# Takes the constants, and returns the lower and the upper corners of boxes, as columns.
+Corners: TypeAlias = "tuple[list[FloatArray], list[FloatArray]]"
+BoxFunction: TypeAlias = "Callable[[Sequence[FloatArray]], Corners]"
 
 # The first instructions of every tape are the coordinates x, y and z.
 COORDINATE_COUNT = 3
@@ -77,6 +83,10 @@ class Operation:
         box.
     limits: computes limits of the operands from those of the result; None if none are known.
     is_of_point: whether the operands are always the coordinates x, y and z themselves.
+    is_member: whether it is an operation of a chain (`chain_operation`).
+    box: of a function of the point, from its constants (c arrays), the lower and the upper corners
+        (3 arrays each) of boxes: the function is at least the distance from the box outside of it;
+        None if no box is known.
     """
 
     name: str
@@ -87,6 +97,8 @@ class Operation:
     choice: ChoiceFunction | None = None
     limits: LimitFunction | None = None
     is_of_point: bool = False
+    is_member: bool = False
+    box: BoxFunction | None = None
 
     def rounded_ranges(self, operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
         """The range of the result on each box, rounded outwards. An end that is NaN becomes
@@ -386,8 +398,17 @@ def _affine(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
 
 def _distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
     """The distance of the point (a, b, c) from a center, and minus a radius, if there is one."""
-    distance = norm(*(a - c for a, c in zip(operands, constants, strict=False)))
-    return distance - constants[3] if len(constants) > 3 else distance
+    distance: Any = jet_of_point_distance(operands, constants[:3])
+    if distance is None:
+        distance = norm(*(a - c for a, c in zip(operands, constants, strict=False)))
+    return _minus(distance, constants[3:])
+
+
+def _minus(distance: Any, radius: Sequence[Any]) -> Any:
+    """The distance minus a radius, if there is one. Only the value of a jet changes."""
+    if not radius:
+        return distance
+    return distance.moved(-radius[0].value) if isinstance(distance, Jet) else distance - radius[0]
 
 
 def _distance_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
@@ -398,14 +419,12 @@ def _distance_ranges(operands: Sequence[Range], constants: Sequence[FloatArray])
 
 def _segment_distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
     """`segment_distance`, and minus a radius, if there is one."""
-    distance = segment_distance(operands, constants[:12], constants[12])
-    return distance - constants[13] if len(constants) > 13 else distance
+    return _minus(segment_distance(operands, constants[:12], constants[12]), constants[13:])
 
 
 def _cone_distance(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
     """`cone_distance`, and minus a radius, if there is one."""
-    distance = cone_distance(operands, constants[:12], *constants[12:15])
-    return distance - constants[15] if len(constants) > 15 else distance
+    return _minus(cone_distance(operands, constants[:12], *constants[12:15]), constants[15:])
 
 
 def _segment_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
@@ -452,10 +471,7 @@ def _gap_of_projections(
     (`_segment_ranges`); at most 0 if there is none. center, half: of the boxes."""
     axis, half_length = constants[:3], constants[12]
     # From the middle of the segment to the center of the box.
-    away = [
-        center[k] - sum(constants[4 * row + k] * constants[4 * row + 3] for row in range(3))
-        for k in range(3)
-    ]
+    away = [c - m for c, m in zip(center, _origin(constants), strict=True)]
     gap: Any = -np.inf
     for k, other, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         gap = np.maximum(gap, np.abs(away[k]) - half[k] - np.abs(axis[k]) * half_length)
@@ -477,6 +493,40 @@ def _cone_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> 
     value = cone_distance(center, constants[:12], *constants[12:15])
     reach = _norm_on_numpy(half, 2.0) + slack + np.abs(constants[12]) * _ROUNDING_OF_POINTS
     return _minus_radius((value - reach, value + reach), constants[15:])
+
+
+def _box_of_ball(constants: Sequence[FloatArray]) -> Corners:
+    """The boxes of balls; of points, if there is no radius."""
+    radius = constants[3] if len(constants) > 3 else 0.0 * constants[0]
+    return _padded([c - radius for c in constants[:3]], [c + radius for c in constants[:3]])
+
+
+def _box_of_segment(constants: Sequence[FloatArray]) -> Corners:
+    """The boxes of capsules; of segments, if there is no radius."""
+    middle, half_length = _origin(constants), constants[12]
+    radius = constants[13] if len(constants) > 13 else 0.0 * half_length
+    reach = [np.abs(constants[k]) * half_length + radius for k in range(3)]
+    return _padded(
+        [c - r for c, r in zip(middle, reach, strict=True)],
+        [c + r for c, r in zip(middle, reach, strict=True)],
+    )
+
+
+def _origin(constants: Sequence[FloatArray]) -> list[FloatArray]:
+    """The point (3,) whose local coordinates in a frame are 0."""
+    return [
+        constants[k] * constants[3]
+        + constants[4 + k] * constants[7]
+        + constants[8 + k] * constants[11]
+        for k in range(3)
+    ]
+
+
+def _padded(lower: list[FloatArray], upper: list[FloatArray]) -> Corners:
+    """Boxes that are larger by the rounding of their corners."""
+    size = functools.reduce(np.maximum, [np.abs(entry) for entry in (*lower, *upper)])
+    slack = _ROUNDING_OF_POINTS * size
+    return [entry - slack for entry in lower], [entry + slack for entry in upper]
 
 
 # The rounding of distances from segments, relative to the size of coordinates.
@@ -547,12 +597,14 @@ _OPERATIONS = (
         lambda a, k: (np.full_like(a[0][0], -np.pi), np.full_like(a[0][0], np.pi)),
     ),
     Operation("distance", 3, 3, _distance, _distance_ranges),
-    Operation("distance of point", 3, 3, _distance, _distance_ranges, is_of_point=True),
-    Operation("ball", 3, 4, _distance, _distance_ranges, is_of_point=True),
+    Operation("distance of point", 3, 3, _distance, _distance_ranges, is_of_point=True,
+              box=_box_of_ball),
+    Operation("ball", 3, 4, _distance, _distance_ranges, is_of_point=True, box=_box_of_ball),
     Operation("segment distance", 3, 13, _segment_distance, _segment_ranges),
     Operation("segment distance of point", 3, 13, _segment_distance, _segment_ranges,
-              is_of_point=True),
-    Operation("capsule", 3, 14, _segment_distance, _segment_ranges, is_of_point=True),
+              is_of_point=True, box=_box_of_segment),
+    Operation("capsule", 3, 14, _segment_distance, _segment_ranges, is_of_point=True,
+              box=_box_of_segment),
     Operation("cone distance", 3, 15, _cone_distance, _cone_ranges),
     Operation("cone distance of point", 3, 15, _cone_distance, _cone_ranges, is_of_point=True),
     Operation("round cone", 3, 16, _cone_distance, _cone_ranges, is_of_point=True),
@@ -576,6 +628,23 @@ def _orthogonal_on_numpy(sides: Sequence[FloatArray]) -> FloatArray:
 def operation_named(name: str) -> Operation:
     """The operation of this name, which has no literals."""
     return _BY_NAME[name]
+
+
+@functools.cache
+def chain_operation(name: str) -> Operation:
+    """The operation of members of a chain: the smaller of the value of the member before and of a
+    function of the point, the operation with this name. So a minimum of many functions is one
+    instruction for each, without results that are kept. Its operands are the member before, which
+    the first one may lack, and then x, y and z; its ranges are those of the function alone."""
+    function = operation_named(name)
+
+    def apply(operands: Sequence[Any], constants: Sequence[Any]) -> Any:
+        return minimum(operands[0], function.apply(operands[1:], constants))
+
+    return Operation(
+        f"minimum with {name}", 1, function.constant_count, apply, function.ranges, is_member=True,
+        box=function.box,
+    )  # fmt: skip
 
 
 @functools.cache

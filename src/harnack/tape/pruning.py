@@ -70,6 +70,9 @@ class BoxLimits:
         )
 
 
+# The places of the octants of a box: for each axis, 0 for the lower half and 1 for the upper one.
+OCTANTS = np.array(list(itertools.product((0, 1), repeat=3)))
+
 # How far limits are from the levels, as a fraction of the range of the formula on the box.
 _LIMIT_SHARE = 1 / 8
 
@@ -81,12 +84,41 @@ class PrunedTapes:
     lists: the lists.
     low, high: (m,) the ranges of the formula on the boxes.
     limits: the values that are computed rightly.
+    caps: (n,) for entries that are members of chains, the number above which their functions do
+        not matter.
     """
 
     lists: BoxTapes
     low: FloatArray
     high: FloatArray
     limits: BoxLimits
+    caps: FloatArray
+
+    def subset(self, which: IntArray) -> PrunedTapes:
+        """The lists of the boxes with these indices."""
+        caps = self.caps[self.lists.entries_of(which)]
+        lists, limits = self.lists.subset(which), self.limits.subset(which)
+        return PrunedTapes(lists, self.low[which], self.high[which], limits, caps)
+
+    def octants(self, middles: FloatArray, margin: float) -> BoxTapes:
+        """For all boxes the lists of their first octants, then those of the second ones, and so on
+        (`OCTANTS`). Members of chains are left out where the box of their function is farther from
+        an octant than their cap, since its distance is a lower bound of the function there.
+
+        middles: (m, 3) the middles of the boxes.
+        margin: how far octants reach beyond their faces.
+        """
+        lists, reach = self.lists, np.maximum(self.caps, 0.0) + margin
+        lower, upper = (ends[:, lists.instructions] for ends in lists.tape.boxes)
+        columns = np.ascontiguousarray(middles.T)[:, lists.boxes]
+        touches = (lower - columns <= reach, columns - upper <= reach)
+        is_member = lists.tape.chains[lists.instructions] >= 0
+        return BoxTapes.concatenated(
+            [
+                lists.without_members(is_member & ~(touches[x][0] & touches[y][1] & touches[z][2]))
+                for x, y, z in OCTANTS.tolist()
+            ]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +133,8 @@ class BoxTapes:
     operands: (3, n) for each entry the entries that are its operands; the entry itself in place of
         operands that its operation does not have. Operations of the point itself
         (`Operation.is_of_point`) have none: coordinates are in a list only where others use them.
+        Members of a chain (`operations.chain_operation`) follow one another, and the first one in a
+        list may have none, too.
     """
 
     tape: Tape
@@ -135,6 +169,35 @@ class BoxTapes:
     def boxes(self) -> IntArray:
         """For each entry (n,) the box whose list it is in."""
         return np.repeat(np.arange(len(self)), self.lengths)
+
+    def entries_of(self, which: IntArray) -> IntArray:
+        """The entries of the lists of the boxes with these indices, one list after another."""
+        lengths = self.lengths[which]
+        starts = np.cumsum(lengths) - lengths
+        return np.arange(lengths.sum()) + np.repeat(self.starts[which] - starts, lengths)
+
+    def without_members(self, is_left_out: BoolArray) -> BoxTapes:
+        """The lists without some members of chains (n,). A chain keeps a member or its first
+        operand."""
+        keeps, same = ~is_left_out, np.arange(len(self.instructions), dtype=np.int32)
+        before = self.operands[0].copy()
+        for kind, group in self._groups:
+            if kind == _CHAIN:
+                chains = self._chains(group)
+                chains.link(keeps[group], chains.has_operand, keeps, same, before)
+                same[group] = same[same[group]]
+        return self._compressed(keeps, same, before)
+
+    def _compressed(self, keeps: BoolArray, same: EntryArray, before: EntryArray) -> BoxTapes:
+        """The lists of the entries that are kept (n,). same: (n,) for each the entry by which it is
+        replaced; before: (n,) its first operand."""
+        new_index = np.cumsum(keeps, dtype=np.int32) - 1
+        kept = np.flatnonzero(keeps)
+        columns = [before, *self.operands[1:]]
+        operands = np.stack([new_index[same[column[kept]]] for column in columns])
+        counts = np.bincount(self.boxes[kept], minlength=len(self))
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        return BoxTapes(self.tape, starts, self.instructions[kept], operands)
 
     def subset(self, which: IntArray) -> BoxTapes:
         """The lists of the boxes with these indices, which may be repeated, in this order."""
@@ -177,16 +240,26 @@ class BoxTapes:
     @functools.cached_property
     def _groups(self) -> list[tuple[int, EntryArray]]:
         """The entries, in groups with the same operation, each group after those of its operands:
-        pairs of the index of the operation (-1 for coordinates) and the entries (k,)."""
-        kinds = self.tape.kinds[self.instructions]
-        keys = self.tape.depths * (len(self.tape.operations) + 1) + self.tape.kinds + 1
+        pairs of the index of the operation (-1 for coordinates) and the entries (k,). Members of
+        chains are groups of their own, whatever their operations, with the index `_CHAIN`."""
+        kinds_of_tape = np.where(self.tape.chains >= 0, _CHAIN, self.tape.kinds)
+        kinds = kinds_of_tape[self.instructions]
+        keys = self.tape.depths * (len(self.tape.operations) + 2) + kinds_of_tape - _CHAIN
         if keys.max() < 1 << 16:
             keys = keys.astype(np.uint16)  # NumPy sorts short integers several times as fast
         keys = keys[self.instructions]
         order = np.argsort(keys, kind="stable").astype(np.int32)
         borders = np.flatnonzero(np.diff(keys[order].astype(np.int64))) + 1
-        groups = np.split(order, borders)
+        groups = np.split(order, borders) if len(order) else []
         return [(int(kinds[group[0]]), group) for group in groups]
+
+    def _chains(self, group: EntryArray) -> _Chains:
+        """The chains of a group."""
+        before = self.operands[0][group]
+        chains = self.tape.chains[self.instructions]
+        is_first = (before != group - 1) | (chains[before] != chains[group])
+        starts = np.flatnonzero(is_first)
+        return _Chains(group, starts, before[starts])
 
     def _operand_columns(self, kind: int, group: EntryArray) -> list[EntryArray]:
         """The operands (k,) of the entries of a group: an array for each operand of the
@@ -211,26 +284,33 @@ class BoxTapes:
         are those of its box. Going down from it, the limits of an entry are the widest that follow
         from the entries that use it (`Operation.limits`), and where the operation chooses an
         operand, the entry is replaced by that one. By the definition of limits no replacement
-        changes a value of the formula that matters. (A replaced entry passes on its own limits.)
+        changes a value of the formula that matters. (A replaced entry passes on its own limits.) A
+        chain is the minimum of its members' functions and of its first operand: those above the cap
+        are left out, but for one if all are.
         """
-        low, high = self._ranges(lower, upper)
+        low, high, members = self._ranges(lower, upper)
         result = self.results
         limits = limits.narrowed(low[result], high[result])
-        same, keeps = self._replacements(low, high, limits)
-        new_index = np.cumsum(keeps, dtype=np.int32) - 1
-        kept = np.flatnonzero(keeps)
-        operands = np.stack([new_index[same[column[kept]]] for column in self.operands])
-        counts = np.bincount(self.boxes[kept], minlength=len(self))
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        lists = BoxTapes(self.tape, starts, self.instructions[kept], operands)
-        return PrunedTapes(lists, low[result], high[result], limits)
+        same, keeps, before, caps = self._replacements(low, high, members, limits)
+        lists = self._compressed(keeps, same, before)
+        return PrunedTapes(lists, low[result], high[result], limits, caps[keeps])
 
-    def _ranges(self, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The ranges of all entries on their boxes: their lower and upper ends (n,)."""
+    def _ranges(
+        self, lower: FloatArray, upper: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The ranges of all entries on their boxes: their lower and upper ends (n,); and the lower
+        ends of the functions of members of chains (n,), which are infinite for other entries. The
+        range of a member is that of its chain."""
         count = len(self.instructions)
-        low, high = np.empty(count), np.empty(count)
-        lower_columns, upper_columns = np.ascontiguousarray(lower.T), np.ascontiguousarray(upper.T)
+        low, high, members = np.empty(count), np.empty(count), np.full(count, np.inf)
+        columns = np.ascontiguousarray(lower.T), np.ascontiguousarray(upper.T)
         for kind, group in self._groups:
+            if kind == _CHAIN:
+                high_members = self._member_ranges(group, columns, members)
+                chains = self._chains(group)
+                low[group] = chains.spread(chains.least(members[group], low))
+                high[group] = chains.spread(chains.least(high_members, high))
+                continue
             if kind < 0:
                 axes, boxes = self.instructions[group], self.boxes[group]
                 low[group], high[group] = lower[boxes, axes], upper[boxes, axes]
@@ -238,25 +318,65 @@ class BoxTapes:
             operation = self.tape.operations[kind]
             ranges = [(low[column], high[column]) for column in self._operand_columns(kind, group)]
             if operation.is_of_point:
-                boxes = self.boxes[group]
-                columns = zip(lower_columns, upper_columns, strict=True)
-                ranges = [(start[boxes], end[boxes]) for start, end in columns]
+                ranges = self._ranges_of_point(group, columns)
             constants = self._constant_columns(kind, group)
             low[group], high[group] = operation.rounded_ranges(ranges, constants)
-        return low, high
+        return low, high, members
+
+    def _ranges_of_point(
+        self, group: EntryArray, columns: tuple[FloatArray, FloatArray]
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """The ranges of x, y and z for the entries of a group. columns: (3, m), (3, m) the corners
+        of the boxes."""
+        boxes = self.boxes[group]
+        return [(start[boxes], end[boxes]) for start, end in zip(*columns, strict=True)]
+
+    def _member_ranges(
+        self, group: EntryArray, columns: tuple[FloatArray, FloatArray], lows: FloatArray
+    ) -> FloatArray:
+        """The ranges of the functions of members of chains: the upper ends (k,), and the lower ends
+        are written to `lows` (n,)."""
+        highs = np.empty(len(group))
+        kinds = self.tape.kinds[self.instructions[group]]
+        for kind in np.unique(kinds).tolist():
+            where = np.flatnonzero(kinds == kind)
+            entries = group[where]
+            constants = self._constant_columns(kind, entries)
+            ranges = self._ranges_of_point(entries, columns)
+            lows[entries], highs[where] = self.tape.operations[kind].rounded_ranges(
+                ranges, constants
+            )
+        return highs
 
     def _replacements(
-        self, low: FloatArray, high: FloatArray, limits_of_boxes: BoxLimits
-    ) -> tuple[EntryArray, BoolArray]:
-        """For each entry (n,) the entry by which it is replaced, mostly itself; and whether the
-        last entry of its list still needs it (n,). low, high: (n,) the ranges of the entries."""
+        self, low: FloatArray, high: FloatArray, members: FloatArray, limits_of_boxes: BoxLimits
+    ) -> tuple[EntryArray, BoolArray, EntryArray, FloatArray]:
+        """For each entry (n,) the entry by which it is replaced, mostly itself; whether the last
+        entry of its list still needs it; its first operand; and for members of chains their cap
+        (`PrunedTapes.caps`). low, high, members: (n,) the ranges of the entries (`_ranges`)."""
         count = len(self.instructions)
         floor, cap = np.full(count, np.inf), np.full(count, -np.inf)
         floor[self.results] = limits_of_boxes.floor
         cap[self.results] = limits_of_boxes.cap
         same, needed = np.arange(count, dtype=np.int32), np.zeros(count, np.bool_)
         needed[self.results] = True
+        before, caps = self.operands[0].copy(), np.full(count, np.inf)
         for kind, whole_group in reversed(self._groups):
+            if kind == _CHAIN:
+                chains = self._chains(whole_group)
+                limits = floor[chains.last], cap[chains.last]
+                own_caps = np.minimum(limits[1], high[chains.last])
+                caps[whole_group] = chains.spread(own_caps)
+                is_used = needed[chains.last]
+                is_kept = members[whole_group] <= caps[whole_group]
+                has_head = chains.has_operand & (low[chains.operands] <= own_caps)
+                chains.link(is_kept, has_head, needed, same, before, is_used)
+                heads = chains.operands[has_head & is_used]
+                needed[heads] = True
+                own_floors = np.maximum(limits[0], low[chains.last])[has_head & is_used]
+                np.minimum.at(floor, heads, own_floors)
+                np.maximum.at(cap, heads, own_caps[has_head & is_used])
+                continue
             group = whole_group[needed[whole_group]]
             if kind < 0 or not len(group):
                 continue
@@ -292,9 +412,9 @@ class BoxTapes:
                 np.maximum.at(cap, column, highest)
         needed &= same == np.arange(count, dtype=np.int32)
         for kind, group in self._groups:
-            if kind >= 0 and self.tape.operations[kind].choice is not None:
+            if kind == _CHAIN or (kind >= 0 and self.tape.operations[kind].choice is not None):
                 same[group] = same[same[group]]
-        return same, needed
+        return same, needed, before, caps
 
     def slots(self) -> tuple[IntArray, int]:
         """For each entry (n,) the slot in which its result is kept, and the number of slots. The
@@ -315,6 +435,76 @@ class BoxTapes:
         for k in np.flatnonzero(is_long):
             most = max(most, lists.assign_one(int(self.starts[k]), int(self.starts[k + 1])))
         return slots, max(most, lists.assign_many(np.flatnonzero(~is_long)))
+
+
+# The index of an operation that stands for all members of chains.
+_CHAIN = -2
+
+
+@dataclass(frozen=True, eq=False)
+class _Chains:
+    """The chains of a group of entries, which are the members of all of them, one after another.
+
+    entries: (k,) the members.
+    starts: (c,) for each chain the place of its first member among the entries.
+    operands: (c,) the first operands: the entry before the chain; the first member itself for none.
+    """
+
+    entries: EntryArray
+    starts: IntArray
+    operands: EntryArray
+
+    @property
+    def first(self) -> EntryArray:
+        """The first members (c,)."""
+        return self.entries[self.starts]
+
+    @property
+    def has_operand(self) -> BoolArray:
+        """Whether chains (c,) have a first operand."""
+        return self.operands != self.first
+
+    @property
+    def last(self) -> EntryArray:
+        """The last members (c,), whose value is that of the chain."""
+        return self.entries[np.append(self.starts[1:], len(self.entries)) - 1]
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Values of chains (c,), for each of their members (k,)."""
+        return np.repeat(values, np.diff(self.starts, append=len(self.entries)))
+
+    def least(self, of_members: FloatArray, of_entries: FloatArray) -> FloatArray:
+        """The least value of each chain (c,). of_members: (k,); of_entries: (n,) those of first
+        operands."""
+        least = np.minimum.reduceat(of_members, self.starts)
+        return np.where(self.has_operand, np.minimum(least, of_entries[self.operands]), least)
+
+    def link(
+        self, is_kept: BoolArray, has_head: BoolArray, keeps: BoolArray, same: EntryArray,
+        before: EntryArray, is_used: BoolArray | None = None,
+    ) -> None:  # fmt: skip
+        """Leave out members: write whether entries are kept (`keeps`), by which entry the last
+        member is replaced (`same`), and which is the first operand of members (`before`), (n,) each.
+        A chain of which nothing would be left keeps its first member.
+
+        is_kept: (k,) whether members matter, which is changed.
+        has_head: (c,) whether the first operand of chains is there and matters.
+        is_used: (c,) whether the value of chains is used; None for all.
+        """
+        counts = np.add.reduceat(is_kept, self.starts, dtype=np.int64)
+        is_kept[self.starts[(counts == 0) & ~has_head]] = True
+        if is_used is not None:
+            is_kept &= self.spread(is_used)
+        keeps[self.entries] = is_kept
+        # For each member the place of the last one that is kept up to it, and of the one before.
+        up_to = np.maximum.accumulate(np.where(is_kept, np.arange(len(is_kept)), -1))
+        earlier = np.append(-1, up_to[:-1])
+        head = self.spread(np.where(has_head, self.operands, -1))
+        previous = np.where(earlier >= self.spread(self.starts), self.entries[earlier], head)
+        before[self.entries] = np.where(previous >= 0, previous, self.entries)
+        final = up_to[np.append(self.starts[1:], len(is_kept)) - 1]
+        value = np.where(final >= self.starts, self.entries[final], self.operands)
+        same[self.last] = value if is_used is None else np.where(is_used, value, self.last)
 
 
 # Lists of more entries are treated one by one when slots are assigned.

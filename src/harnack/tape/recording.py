@@ -21,6 +21,7 @@ from harnack.tape.operations import (
     COORDINATE_COUNT,
     Operation,
     blend_operation,
+    chain_operation,
     function_operation,
     norm_operation,
     operation_named,
@@ -50,6 +51,8 @@ class Tape:
     kinds: (n,) for each instruction the index of its operation; -1 for coordinates.
     operands: (n, 3) the instructions that are its operands, all before it; -1 for none.
     constants: (n, c) its constants, 0 where there are fewer.
+    chains: (n,) for each member of a chain (`operations.chain_operation`) the number of its chain;
+        -1 for other instructions. The members of a chain follow one another.
     result: the instruction whose result is the value of the formula.
     call_count: how many operations the formula did, where equal ones, which are one instruction,
         count each time.
@@ -59,16 +62,36 @@ class Tape:
     kinds: IntArray
     operands: IntArray
     constants: FloatArray
+    chains: IntArray
     result: int
     call_count: int
 
     def __len__(self) -> int:
         return len(self.kinds)
 
+    @property
+    def operation_count(self) -> int:
+        """The number of operations of numbers: two for a member of a chain."""
+        return len(self) + int((self.chains >= 0).sum())
+
     @functools.cached_property
     def constant_columns(self) -> FloatArray:
         """The constants as an array (c, n)."""
         return np.ascontiguousarray(self.constants.T)
+
+    @functools.cached_property
+    def boxes(self) -> tuple[FloatArray, FloatArray]:
+        """For each instruction (3, n) the lower and the upper corner of the box of its function
+        (`Operation.box`); that of all points where none is known."""
+        lower, upper = np.full((3, len(self)), -np.inf), np.full((3, len(self)), np.inf)
+        for kind, operation in enumerate(self.operations):
+            if operation.box is not None:
+                which = np.flatnonzero(self.kinds == kind)
+                constants = [column[which] for column in self.constant_columns]
+                lower[:, which], upper[:, which] = operation.box(
+                    constants[: operation.constant_count]
+                )
+        return lower, upper
 
     @functools.cached_property
     def is_of_point(self) -> BoolArray:
@@ -78,20 +101,26 @@ class Tape:
 
     @functools.cached_property
     def depths(self) -> IntArray:
-        """For each instruction (n,) the length of the longest chain of operands below it."""
+        """For each instruction (n,) the length of the longest path of operands below it, on which
+        all members of a chain count as one."""
         depths = [0] * len(self)
         rows: list[list[int]] = self.operands.tolist()
+        chains: list[int] = self.chains.tolist()
         for k, operands in enumerate(rows):
-            depths[k] = 1 + max((depths[j] for j in operands if j >= 0), default=-1)
+            if chains[k] >= 0 and chains[k] == chains[k - 1]:
+                depths[k] = depths[k - 1]
+            else:
+                depths[k] = 1 + max((depths[j] for j in operands if j >= 0), default=-1)
         return np.array(depths, np.int64)
 
 
-_Row: TypeAlias = "tuple[int, tuple[int, ...], tuple[float, ...]]"
+# The index of the operation, the operands, the constants, and the number of the chain or -1.
+_Row: TypeAlias = "tuple[int, tuple[int, ...], tuple[float, ...], int]"
 
 
 def _coordinate_rows() -> list[_Row]:
     """The rows of the coordinates, which have no operation."""
-    return [(-1, (), ()) for _ in range(COORDINATE_COUNT)]
+    return [(-1, (), (), -1) for _ in range(COORDINATE_COUNT)]
 
 
 @dataclass(eq=False)
@@ -104,6 +133,7 @@ class _Recorder:
     kind_of: dict[str, int] = field(default_factory=dict[str, int])
     index_of: dict[Any, int] = field(default_factory=dict[Any, int])
     call_count: int = 0
+    chain_count: int = 0
 
     def add(
         self, operation: Operation, operands: tuple[int, ...], constants: tuple[float, ...] = ()
@@ -113,20 +143,43 @@ class _Recorder:
         key = operation.name, operands, constants
         index = self.index_of.get(key)
         if index is None:
-            kind = self.kind_of.get(operation.name)
-            if kind is None:
-                kind = self.kind_of[operation.name] = len(self.operations)
-                self.operations.append(operation)
             index = self.index_of[key] = len(self.rows)
-            self.rows.append((kind, operands, constants))
+            self.rows.append((self._kind(operation), operands, constants, -1))
         return index
+
+    def add_chain(
+        self, head: int | None, members: Sequence[tuple[Operation, Sequence[tuple[float, ...]]]]
+    ) -> int:
+        """Add a chain, and return the index of its last member.
+
+        head: the instruction before the first member; None for none.
+        members: for each operation of the point that occurs, the constants of its members.
+        """
+        chain = self.chain_count
+        self.chain_count += 1
+        before = () if head is None else (head,)
+        for function, constants in members:
+            kind = self._kind(chain_operation(function.name))
+            self.call_count += len(constants)
+            for row in constants:
+                self.rows.append((kind, before, row, chain))
+                before = (len(self.rows) - 1,)
+        return before[0]
+
+    def _kind(self, operation: Operation) -> int:
+        """The index of an operation among those that occur."""
+        kind = self.kind_of.get(operation.name)
+        if kind is None:
+            kind = self.kind_of[operation.name] = len(self.operations)
+            self.operations.append(operation)
+        return kind
 
     def tape(self, result: int) -> Tape:
         """The tape of the instructions that the result depends on. Each comes after its operands,
         and the operand with the longest chain below it comes first, so that few results have to be
         kept at a time."""
         depths = [0] * len(self.rows)
-        for k, (_, operands, _) in enumerate(self.rows):
+        for k, (_, operands, _, _) in enumerate(self.rows):
             depths[k] = 1 + max((depths[j] for j in operands), default=-1)
         new_index = {k: k for k in range(COORDINATE_COUNT)}
         rows, stack = self.rows[:COORDINATE_COUNT], [result]
@@ -141,15 +194,24 @@ class _Recorder:
                 new_index[k] = len(rows)
                 rows.append(self.rows[k])
         operands = np.full((len(rows), _MAX_OPERANDS), -1, np.int64)
-        width = max((len(row[2]) for row in rows), default=0)
+        for k, row in enumerate(rows):
+            if row[1]:
+                operands[k, : len(row[1])] = [new_index[j] for j in row[1]]
+        # Functions of the point that became members of chains do not occur by themselves.
+        used, kinds = np.unique([row[0] for row in rows], return_inverse=True)
+        kinds -= 1  # of coordinates, whose number of an operation is -1
+        operations = tuple(self.operations[k] for k in used[1:].tolist())
+        width = max((operation.constant_count for operation in operations), default=0)
         constants = np.zeros((len(rows), max(width, 1)))
-        for k, (_, row_operands, row_constants) in enumerate(rows):
-            operands[k, : len(row_operands)] = [new_index[j] for j in row_operands]
-            constants[k, : len(row_constants)] = row_constants
-        kinds = np.array([kind for kind, _, _ in rows], np.int64)
+        for kind, operation in enumerate(operations):
+            of_kind = np.flatnonzero(kinds == kind)
+            numbers = np.array([rows[k][2] for k in of_kind.tolist()], np.float64)
+            constants[of_kind, : operation.constant_count] = numbers
+        chains = np.array([row[3] for row in rows], np.int64)
         return Tape(
-            tuple(self.operations), kinds, operands, constants, new_index[result], self.call_count
-        )
+            operations, kinds, operands, constants, chains, new_index[result],
+            self.call_count,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +268,7 @@ class TapeNumber(FormulaNumber):
         if not factors:
             return add(operation_named("constant"), (), (shift,))
         if factors == (1.0,):
-            kind, operands, constants = self.recorder.rows[indices[0]]
+            kind, operands, constants, _ = self.recorder.rows[indices[0]]
             name = _MINUS_RADIUS.get(self.recorder.operations[kind].name) if kind >= 0 else None
             if name is not None:
                 return add(operation_named(name), operands, (*constants, -shift))
@@ -348,20 +410,45 @@ class TapeNumber(FormulaNumber):
             return self._of_instruction(self.recorder.add(operation, indices, center))
         return self._instruction(norm_operation(len(values), p), values)
 
+    def _extremum(self, name: str, numbers: list[TapeNumber]) -> TapeNumber:
+        """The minimum or maximum of numbers. Those that are functions of the point are members of a
+        chain, for a minimum; of the others a balanced tree is made, so that a box does not decide
+        one operand after another."""
+        operation, rows = operation_named(name), self.recorder.rows
+        members: dict[int, list[tuple[float, ...]]] = {}
+        others: list[TapeNumber] = []
+        for number in {number.index: number for number in numbers}.values():
+            kind, _, constants, _ = rows[number.index]
+            if name == "minimum" and kind >= 0 and self.recorder.operations[kind].is_of_point:
+                members.setdefault(kind, []).append(constants)
+            else:
+                others.append(number)
+        while len(others) > 1:
+            pairs = [others[k : k + 2] for k in range(0, len(others), 2)]
+            others = [
+                self._instruction(operation, pair) if len(pair) > 1 else pair[0] for pair in pairs
+            ]
+        if not members:
+            return others[0]
+        head = others[0].index if others else None
+        functions = [(self.recorder.operations[kind], rows) for kind, rows in members.items()]
+        return self._of_instruction(self.recorder.add_chain(head, functions))
+
+    def least_of_rows(self, name: str, point: Sequence[Any], rows: FloatArray) -> TapeNumber | None:
+        """A chain with a member for each row; None if the point is moved."""
+        if [number.index for number in point] != list(range(COORDINATE_COUNT)):
+            return None
+        constants = [tuple(row) for row in rows.tolist()]
+        self.recorder.call_count += len(constants)
+        index = self.recorder.add_chain(None, [(operation_named(name), constants)])
+        return self._of_instruction(index)
+
     def of_several(self, name: str, values: Sequence[Any], *literals: float) -> TapeNumber | None:
         numbers: list[TapeNumber] = [self.coerce(value) for value in values]
         if name == "norm":
             return self._norm(numbers, *literals)
         if name in ("maximum", "minimum"):
-            # A balanced tree: in a chain a box would decide one operand after another.
-            operation = operation_named(name)
-            while len(numbers) > 1:
-                pairs = [numbers[k : k + 2] for k in range(0, len(numbers), 2)]
-                numbers = [
-                    self._instruction(operation, pair) if len(pair) > 1 else pair[0]
-                    for pair in pairs
-                ]
-            return numbers[0]
+            return self._extremum(name, numbers)
         if name == "orthogonal intersection":
             count = len(numbers)
             if not 2 <= count <= _MAX_OPERANDS:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harnack.arithmetic import cone_distance, minimum, segment_distance
-from harnack.arithmetic.operators import Tally, tally_of
-from harnack.backend import FloatArray, IntArray
+from harnack.arithmetic.operators import FormulaNumber, Tally, tally_of
+from harnack.backend import BoolArray, FloatArray, IntArray
 from harnack.backend.validation import no_derivatives
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.solids.booleans import smooth_union
@@ -80,8 +80,9 @@ class Struts(FormulaSolid):
         return RoundCone(start, end, (first, second))
 
     @functools.cached_property
-    def _distances(self) -> tuple[tuple[tuple[float, ...], bool], ...]:
-        """For each strut the numbers of its distance and its radius, and whether it is a cone."""
+    def _rows(self) -> tuple[FloatArray, BoolArray]:
+        """For each strut the numbers of its distance and then its radius, in a row (m, 16) that is
+        padded; and whether it is a cone (m,)."""
         radii = self.radii[self.edges]
         larger = np.where(radii[:, 1] > radii[:, 0], 1, 0)
         ends = np.stack([larger, 1 - larger], axis=1)
@@ -91,28 +92,32 @@ class Struts(FormulaSolid):
         vector = end - start
         length = np.linalg.norm(vector, axis=1)
         is_nested, slope, ratio = cone_numbers(length, radii)
-        is_cone = radii[:, 0] != radii[:, 1]
+        is_cone = (radii[:, 0] != radii[:, 1]) & ~is_nested
         # A ball that contains the other one is a capsule without a length.
         reach = np.where(is_nested, 0.0, 0.5 * length)
         origins = np.where((is_cone | is_nested)[:, None], start, 0.5 * start + 0.5 * end)
         frames = axial_frames(origins, vector)
-        capsules = np.column_stack([frames, reach, radii[:, 0]]).tolist()
-        cones = np.column_stack([frames, length, slope, ratio, radii[:, 0]]).tolist()
-        kinds: list[bool] = (is_cone & ~is_nested).tolist()
-        return tuple(
-            (tuple(cone if kind else capsule), kind)
-            for cone, capsule, kind in zip(cones, capsules, kinds, strict=True)
-        )
+        nothing = np.zeros((len(frames), 2))
+        capsules = np.column_stack([frames, reach, radii[:, 0], nothing])
+        cones = np.column_stack([frames, length, slope, ratio, radii[:, 0]])
+        return np.where(is_cone[:, None], cones, capsules), is_cone
 
     def _strut_function(self, number: int, point: tuple[Any, Any, Any]) -> Any:
         """The function of the strut of an edge."""
-        numbers, is_cone = self._distances[number]
-        if is_cone:
+        rows, is_cone = self._rows
+        numbers = rows[number].tolist()
+        if is_cone[number]:
             return cone_distance(point, numbers[:12], *numbers[12:15]) - numbers[15]
         return segment_distance(point, numbers[:12], numbers[12]) - numbers[13]
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        values = [self._strut_function(k, (x, y, z)) for k in range(len(self.edges))]
+        point, (rows, is_cone) = (x, y, z), self._rows
+        values: list[Any] = []
+        if isinstance(x, FormulaNumber):
+            kinds = (("round cone", rows[is_cone]), ("capsule", rows[~is_cone, :14]))
+            values = [x.least_of_rows(name, point, own) for name, own in kinds if len(own)]
+        if not values or values[0] is None:
+            values = [self._strut_function(k, point) for k in range(len(rows))]
         return minimum(*values) if len(values) > 1 else values[0]
 
     @functools.cached_property
