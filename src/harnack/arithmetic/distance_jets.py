@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.arithmetic.interval import Interval, machine_epsilon, pad_underflow, round_down
-from harnack.arithmetic.interval import smallest_normal
+from harnack.arithmetic.interval import (
+    Interval,
+    machine_epsilon,
+    pad_underflow,
+    round_down,
+    smallest_normal,
+)
 from harnack.arithmetic.jet import Jet
 from harnack.backend.elementary import fmax, fmin
 
@@ -176,8 +181,8 @@ class _Distance:
     coordinate is computed with three roundings by e/2 of at most S = `size`, so that its error is
     at most 3 e S; that of the clipped one at most 4 e S + 2 e L =: D. So the vector q has an error
     of at most 2 D, and f too, but for the rounding of the norm by 4 e of it. The unit vector q/|q|
-    has an error of at most twice that of q, divided by |q|, and as all slopes are at most |d|, those
-    of f follow. Squares that underflow add at most the root of the smallest normal numbers.
+    has an error of at most twice that of q, divided by |q|, and as all slopes are at most |d|,
+    those of f follow. Squares that underflow add at most the root of the smallest normal numbers.
     """
 
     start: _Start
@@ -247,11 +252,12 @@ class _Distance:
         epsilon = self._epsilon
         slack = dr.fma(length, 5 * epsilon, 2 * error + self._tiny_length)
         inverse = 1 / length
-        of_normal = dr.fma(4 * error, inverse, 12 * epsilon)
-        # (Overflow gives the error 2 and the range from 0.)
-        of_normal = dr.select(length > slack, of_normal, 2.0)
+        # Where the point may be on the segment, and where squares overflow, nothing is known.
+        is_known = length > slack
+        of_normal = dr.select(is_known, dr.fma(4 * error, inverse, 12 * epsilon), 2.0)
+        normal = [dr.select(is_known, entry * inverse, 0.0) for entry in (u, v, w)]
         value = Interval(fmax(length - slack, 0.0), length + slack)
-        return _Nearest(value, [u * inverse, v * inverse, w * inverse], of_normal)
+        return _Nearest(value, normal, of_normal)
 
     def _clipped(self, along: Real) -> Real:
         """The coordinate along the axis, from the nearest point of the segment."""

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from harnack.arithmetic.functions import ElementaryFunction
-    from harnack.backend import Real
+    from harnack.backend import FloatArray, Real
 
 # NumPy's functions of such numbers: numpy.sin(x) is sin(x).
 _UFUNCS = {

@@ -36,7 +36,7 @@ _COARSER = 2
 # have more entries.
 _MAX_OCTANTS, _MAX_ENTRIES = 1_000_000, 24_000_000
 # The number of entries that are treated at once, so that they stay in the processor's cache.
-_ENTRIES_AT_ONCE = 400_000
+_ENTRIES_AT_ONCE = 100_000
 
 
 @dataclass(frozen=True)

@@ -106,9 +106,10 @@ class Operation:
         with np.errstate(all="ignore"):
             low, high = self.ranges(operands, constants)
             slack = _UNITS * float(np.finfo(np.float64).eps)
-            low = low - slack * np.abs(low) - _TINY
-            high = high + slack * np.abs(high) + _TINY
-        return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+            low = low - (slack * np.abs(low) + _TINY)
+            high = high + (slack * np.abs(high) + _TINY)
+        # (fmax and fmin take the number in place of NaN.)
+        return np.fmax(low, -np.inf), np.fmin(high, np.inf)
 
 
 # Ranges.

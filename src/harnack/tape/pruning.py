@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -111,7 +111,7 @@ class PrunedTapes:
         lists, reach = self.lists, np.maximum(self.caps, 0.0) + margin
         lower, upper = (ends[:, lists.instructions] for ends in lists.tape.boxes)
         columns = np.ascontiguousarray(middles.T)[:, lists.boxes]
-        touches = (lower - columns <= reach, columns - upper <= reach)
+        touches: Any = (lower - columns <= reach, columns - upper <= reach)
         is_member = lists.tape.chains[lists.instructions] >= 0
         return BoxTapes.concatenated(
             [
@@ -174,7 +174,8 @@ class BoxTapes:
         """The entries of the lists of the boxes with these indices, one list after another."""
         lengths = self.lengths[which]
         starts = np.cumsum(lengths) - lengths
-        return np.arange(lengths.sum()) + np.repeat(self.starts[which] - starts, lengths)
+        offsets: IntArray = np.repeat(self.starts[which] - starts, lengths)
+        return np.arange(len(offsets)) + offsets
 
     def without_members(self, is_left_out: BoolArray) -> BoxTapes:
         """The lists without some members of chains (n,). A chain keeps a member or its first
@@ -338,14 +339,13 @@ class BoxTapes:
         are written to `lows` (n,)."""
         highs = np.empty(len(group))
         kinds = self.tape.kinds[self.instructions[group]]
-        for kind in np.unique(kinds).tolist():
+        for kind in np.flatnonzero(np.bincount(kinds)).tolist():
             where = np.flatnonzero(kinds == kind)
-            entries = group[where]
-            constants = self._constant_columns(kind, entries)
+            entries = group[where] if len(where) < len(group) else group
             ranges = self._ranges_of_point(entries, columns)
-            lows[entries], highs[where] = self.tape.operations[kind].rounded_ranges(
-                ranges, constants
-            )
+            constants = self._constant_columns(kind, entries)
+            own = self.tape.operations[kind].rounded_ranges(ranges, constants)
+            lows[entries], highs[where] = own
         return highs
 
     def _replacements(
@@ -469,7 +469,7 @@ class _Chains:
         """The last members (c,), whose value is that of the chain."""
         return self.entries[np.append(self.starts[1:], len(self.entries)) - 1]
 
-    def spread(self, values: FloatArray) -> FloatArray:
+    def spread(self, values: Any) -> Any:
         """Values of chains (c,), for each of their members (k,)."""
         return np.repeat(values, np.diff(self.starts, append=len(self.entries)))
 
@@ -484,8 +484,8 @@ class _Chains:
         before: EntryArray, is_used: BoolArray | None = None,
     ) -> None:  # fmt: skip
         """Leave out members: write whether entries are kept (`keeps`), by which entry the last
-        member is replaced (`same`), and which is the first operand of members (`before`), (n,) each.
-        A chain of which nothing would be left keeps its first member.
+        member is replaced (`same`), and which is the first operand of members (`before`), each
+        (n,). A chain of which nothing would be left keeps its first member.
 
         is_kept: (k,) whether members matter, which is changed.
         has_head: (c,) whether the first operand of chains is there and matters.

@@ -157,14 +157,15 @@ class _Recorder:
         """
         chain = self.chain_count
         self.chain_count += 1
-        before = () if head is None else (head,)
+        index, before = -1, () if head is None else (head,)
         for function, constants in members:
             kind = self._kind(chain_operation(function.name))
             self.call_count += len(constants)
             for row in constants:
+                index = len(self.rows)
                 self.rows.append((kind, before, row, chain))
-                before = (len(self.rows) - 1,)
-        return before[0]
+                before = (index,)
+        return index
 
     def _kind(self, operation: Operation) -> int:
         """The index of an operation among those that occur."""
@@ -198,9 +199,10 @@ class _Recorder:
             if row[1]:
                 operands[k, : len(row[1])] = [new_index[j] for j in row[1]]
         # Functions of the point that became members of chains do not occur by themselves.
-        used, kinds = np.unique([row[0] for row in rows], return_inverse=True)
-        kinds -= 1  # of coordinates, whose number of an operation is -1
-        operations = tuple(self.operations[k] for k in used[1:].tolist())
+        used = sorted({row[0] for row in rows} - {-1})
+        operations = tuple(self.operations[k] for k in used)
+        new_kind = {-1: -1} | {k: new for new, k in enumerate(used)}
+        kinds = np.array([new_kind[row[0]] for row in rows], np.int64)
         width = max((operation.constant_count for operation in operations), default=0)
         constants = np.zeros((len(rows), max(width, 1)))
         for kind, operation in enumerate(operations):
