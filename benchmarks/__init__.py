@@ -1,2 +1,3 @@
-"""Speed and evaluation counts, measured as ratios in one run. `python -m benchmarks` writes the
-tables and plots into docs/benchmarks.md."""
+"""Benchmarks: `make bench` runs them, and they write their own tables into the docs."""
+
+import harnack  # noqa: F401  # before Dr.Jit, so that this loads an LLVM that works

@@ -72,7 +72,7 @@ class TapeCells(GridData):
         """
         depth = round(3.5 + np.log2(tape.operation_count) / 3) - (0 if levels else _COARSER)
         depth = int(np.clip(depth, _MIN_DEPTH, _MAX_DEPTH))
-        if all(operation.choice is None for operation in tape.operations):
+        if all(o.choice is None and not o.is_member for o in tape.operations):
             # Nothing is ever left out of a list, so that cells only tell where no level is.
             depth = min(depth, _DEPTH_OF_WHOLE_LISTS)
         reach = float(np.abs([lower, upper]).max())
