@@ -345,3 +345,22 @@ def test_ranges_of_segments_and_cones_contain_all_values() -> None:
             values = solid.value(points, precision="double")
             assert low <= values.min()
             assert values.max() <= high
+
+
+def test_a_text_of_many_spheres_has_a_proved_box() -> None:
+    centers = np.random.default_rng(5).uniform(-0.5, 0.5, (60, 3)).round(4)
+    texts = [f"sqrt((x-({a}))^2 + (y-({b}))^2 + (z-({c}))^2) - 0.1" for a, b, c in centers]
+    surface = hk.expression(f"min({', '.join(texts)})")
+    extent = surface.extent((0.0,))
+    assert extent is not None
+    lower, upper = (np.array(corner) for corner in extent.bounds())
+    assert (lower <= centers.min(axis=0) - 0.1).all()
+    assert (upper >= centers.max(axis=0) + 0.1).all()
+    assert (upper - lower).max() < 1.3
+    # A cylinder has no end.
+    assert hk.expression("min(x^2 + y^2 - 1, " + ", ".join(texts) + ")").extent((0.0,)) is None
+    origins = np.column_stack([centers[:, :2], np.full(60, 3.0)])
+    hits = hk.trace(surface, origins, [[0, 0, -1]], precision="double")
+    near = np.linalg.norm(centers[:, None, :2] - centers[None, :, :2], axis=-1)
+    tops = np.where(near < 0.1, centers[:, 2] + np.sqrt(np.fmax(0.01 - near**2, 0)), -np.inf)
+    np.testing.assert_allclose(hits.t, 3.0 - tops.max(axis=1), atol=1e-3)

@@ -6,7 +6,6 @@ or a call of a function), and then evaluated; it is never run as Python."""
 from __future__ import annotations
 
 import ast
-import functools
 import inspect
 import math
 import re
@@ -21,7 +20,7 @@ from harnack import arithmetic
 from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
 from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
 from harnack.fields.formula_evaluator import as_jet
-from harnack.fields.tape_evaluator import recorded_tape
+from harnack.fields.tape_evaluator import extent_of_long_formula, recorded_tape
 from harnack.fields.vm_formulas import VmFormula
 from harnack.name_suggestions import did_you_mean
 
@@ -39,12 +38,11 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = MappingProxyType(
             "sqrt", "norm", "atan2",
         )},
         "ln": arithmetic.log, "abs": arithmetic.absolute,
-        "max": lambda *several: functools.reduce(arithmetic.maximum, several),
-        "min": lambda *several: functools.reduce(arithmetic.minimum, several),
+        "max": arithmetic.maximum, "min": arithmetic.minimum,
     }
 )  # fmt: skip
 # Functions of more than one argument: the smallest and the largest number of arguments.
-_ARGUMENT_COUNTS = {"max": (2, 99), "min": (2, 99), "norm": (2, 3), "atan2": (2, 2)}
+_ARGUMENT_COUNTS = {"max": (2, math.inf), "min": (2, math.inf), "norm": (2, 3), "atan2": (2, 2)}
 _OPERATORS: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = MappingProxyType(
     {
         ast.Add: lambda a, b: a + b,
@@ -254,13 +252,13 @@ def _check_call(text: str, node: ast.Call, parameters: Iterable[str], depth: int
         names = ", ".join(_FUNCTIONS)
         hint = did_you_mean(name, _FUNCTIONS)
         raise _formula_error(text, f"{name!r} is no known function, there are {names}{hint}")
-    # Most functions take one argument. A largest number above 9 counts as no limit in the message.
+    # Most functions take one argument.
     fewest, largest = _ARGUMENT_COUNTS.get(name, (1, 1))
     if node.keywords or not fewest <= len(node.args) <= largest:
         count = (
             f"{fewest} or {largest}"
-            if fewest < largest < 9
-            else f"{fewest}{' or more' * (largest > 9)}"
+            if fewest < largest < math.inf
+            else f"{fewest}{' or more' * (largest == math.inf)}"
         )
         plural = "s" if largest > 1 else ""
         raise _formula_error(text, f"{name} takes {count} argument{plural}, not {len(node.args)}")
@@ -374,6 +372,11 @@ class Expression(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return self.function(x, y, z)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        if self.domain is not None:
+            return self.domain
+        return extent_of_long_formula(self, levels)
 
 
 class ExpressionFunction(Protocol):

@@ -24,18 +24,21 @@ from harnack.enclosures.samples import RaySample
 from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.field import Field
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaOnRay
+from harnack.geometry import Box
 from harnack.tape.cells import CELL_MARGIN, TapeCells
 from harnack.tape.interpreter import TapeProgram, rounded_ends
+from harnack.tape.level_box import level_box
 from harnack.tape.pruning import BoxTapes
 from harnack.tape.recording import Tape, record
 from harnack.tree.empty_space import EmptySpaceGrid, OccupancyGrid
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Index, Mask, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Index, Mask, Real, Vec3
     from harnack.enclosures.samples import Ray, Sample
     from harnack.fields.evaluator import Plan
+    from harnack.geometry import Volume
 
-__all__ = ["TapeEvaluator", "recorded_tape", "tape_evaluator"]
+__all__ = ["TapeEvaluator", "extent_of_long_formula", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted, and combinations of more than half as many, since
 # much of them is left out in each cell; shorter ones are compiled.
@@ -51,6 +54,8 @@ _ROUNDINGS = 64.0
 # For each field its tape, and its cells by levels.
 _TAPES: FieldCache[Tape | None] = FieldCache()
 _CELLS: FieldCache[dict[tuple[float, ...], TapeCells | None]] = FieldCache()
+# For each field, by levels, the corners of a box around them.
+_BOXES: FieldCache[dict[tuple[float, ...], tuple[FloatArray, FloatArray] | None]] = FieldCache()
 # The largest number of levels for which the cells of a field are kept.
 _MAX_KEPT = 4
 
@@ -78,11 +83,7 @@ def tape_evaluator(
     shortest: the largest number of instructions of a short formula; None for the number from which
         on interpreting was measured to be quicker.
     """
-    tape = recorded_tape(field)
-    if shortest is None:
-        is_single = hasattr(cast("Any", type(field)), "tally")
-        shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
-    if tape is None or (tape.operation_count <= shortest and tape.call_count <= _MAX_OPERATIONS):
+    if not _is_long(field, shortest):
         return None
     uploaded: _UploadedTape = _upload(field, backend, plan.levels)
     lipschitz = getattr(field, "lipschitz", None)
@@ -90,6 +91,34 @@ def tape_evaluator(
     whole = uploaded.program.formula(dr.opaque(backend.UInt32, 0))
     dr.eval(whole.begin, whole.end)  # data of kernels, which are recorded (`harnack.webgpu`)
     return TapeEvaluator(field, whole, constant, uploaded)
+
+
+def _is_long(field: Any, shortest: int | None) -> bool:
+    """Whether a field is interpreted (`tape_evaluator`)."""
+    tape = recorded_tape(field)
+    if tape is None:
+        return False
+    if shortest is None:
+        is_single = hasattr(cast("Any", type(field)), "tally")
+        shortest = _MIN_INSTRUCTIONS if is_single else _MIN_INSTRUCTIONS // 2
+    return tape.operation_count > shortest or tape.call_count > _MAX_OPERATIONS
+
+
+def extent_of_long_formula(field: Any, levels: tuple[float, ...]) -> Volume | None:
+    """A box that contains the level sets of a formula that is interpreted, by its ranges on
+    half-spaces; None for other formulas, and if none is found."""
+    if not levels or not _is_long(field, None):
+        return None
+    kept = _BOXES.get(field, None, dict)
+    if levels not in kept:
+        tape = recorded_tape(field)
+        assert tape is not None
+        kept[levels] = level_box(tape, levels)
+    corners = kept[levels]
+    if corners is None:
+        return None
+    (a, b, c), (d, e, f) = (corner.tolist() for corner in corners)
+    return Box((a, b, c), (d, e, f))
 
 
 @cached_upload

@@ -552,8 +552,8 @@ def _minus_radius(distance: Range, radius: Sequence[FloatArray]) -> Range:
     low, high = distance
     if not len(radius):
         return low, high
-    slack = _UNITS * float(np.finfo(np.float64).eps) * np.abs(high)
-    return low - slack - radius[0], high + slack - radius[0]
+    slack = _UNITS * float(np.finfo(np.float64).eps)
+    return low - slack * np.abs(low) - radius[0], high + slack * np.abs(high) - radius[0]
 
 
 _OPERATIONS = (
