@@ -6,6 +6,7 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -267,6 +268,14 @@ class TapeEvaluator(FormulaEvaluator):
     @property
     def is_steep(self) -> bool:
         return self._roughness[2]
+
+    @property
+    def list_margin(self) -> float:
+        """How far from the surface the values of short lists are those of f, as measured: hits
+        within this length are sampled by their lists, others mostly by the whole tape. Infinite
+        without cells."""
+        cells = self.uploaded.cells
+        return math.inf if cells is None else CELL_MARGIN * cells.cell_size
 
     def _with_list(self, formula: Any, radius: Real | None) -> FormulaEvaluator:
         """The evaluator of a formula that is valid within a radius; None for everywhere."""
