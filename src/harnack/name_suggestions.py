@@ -3,7 +3,6 @@ known names; and the article before a name."""
 
 from __future__ import annotations
 
-import difflib
 import functools
 import inspect
 import re
@@ -29,6 +28,8 @@ def did_you_mean(misspelled: object, candidates: Iterable[str]) -> str:
     last among them, is similar. If no spelling is similar, it is a candidate that has a word which
     begins with the name: "tolerance" for "tol", "default_level" for "level".
     """
+    import difflib  # imported here, for messages alone
+
     if not isinstance(misspelled, str):
         return ""
     name_of_lowercase = {name.lower(): name for name in candidates}

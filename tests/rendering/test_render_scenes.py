@@ -525,3 +525,18 @@ def test_channels_of_mitsuba_are_written_with_their_names(tmp_path: Any) -> None
         written = file.channels()
         assert "d.T" in written
         np.testing.assert_array_equal(written["d.T"].pixels, found[..., -1])
+
+
+def test_integrators_in_python_draw_and_differentiate() -> None:
+    # Their loops are rewritten when they are first called.
+    scene = mi.load_dict(
+        {"type": "scene", "light": {"type": "constant"}, "camera": sensor(size=4)}, parallel=False
+    )
+    parameters = mi.traverse(scene)
+    radiance = parameters["light.radiance.value"]
+    dr.enable_grad(radiance)
+    integrator = mi.load_dict({"type": "prb_basic"})
+    image = mi.render(scene, parameters, integrator=integrator, spp=1)
+    dr.backward(dr.mean(image, axis=None))
+    np.testing.assert_allclose(np.array(image), 1.0, rtol=1e-5)
+    assert float(dr.grad(radiance)[0]) == pytest.approx(1.0, rel=1e-5)

@@ -16,6 +16,7 @@ from harnack.backend import choose_backend
 from harnack.fields import tape_evaluator
 from harnack.fields.batched_fields import FieldCache
 from harnack.fields.solids.solid import Solid
+from harnack.tape import pruning
 from harnack.tape.cells import TapeCells
 from harnack.tape.pruning import BoxLimits, BoxTapes
 from harnack.tape.recording import Tape, record
@@ -96,7 +97,10 @@ def test_lists_hold_coordinates_only_where_others_than_balls_read_them() -> None
     assert boxes.lengths.tolist() == [1, 2, 3]
 
 
-def test_equal_lists_are_stored_once() -> None:
+@pytest.mark.parametrize("hashes_differ", [True, False])
+def test_equal_lists_are_stored_once(monkeypatch: pytest.MonkeyPatch, hashes_differ: bool) -> None:
+    if not hashes_differ:
+        monkeypatch.setattr(pruning, "_hashes", lambda columns, places: 0 * places)
     model = random_model(np.random.default_rng(0), 40, 0.3)
     cells = TapeCells.of(record(model.formula), np.full(3, -1.5), np.full(3, 1.5), (0.0,))
     distinct, index = cells.lists.distinct()

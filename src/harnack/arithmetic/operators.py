@@ -384,7 +384,9 @@ class Tally:
         return self.steepest * max(self.farthest / _FAR, 1.0) >= _ABRUPT * finest
 
 
-@dataclass(frozen=True, eq=False)
+# Not frozen, as there are ten of them for each part of a model: a frozen one takes twice as long to
+# make.
+@dataclass(eq=False)
 class OperationCounter(FormulaNumber):
     """A number without a value: a formula that is evaluated with such numbers records its
     operations in a tally, which all of them share. It knows only estimates of its size and its
@@ -510,6 +512,25 @@ class OperationCounter(FormulaNumber):
         # The derivative of x^(1/p) is 1/(p size^(p-1)), with size = x^(1/p).
         size = max(self.size, 1.0) ** (1 / p)
         return self._bent(_FUNCTION, self, size, self.rate / (p * size ** (p - 1)))
+
+    def of_several(
+        self, name: str, values: Sequence[Any], *literals: float
+    ) -> OperationCounter | None:
+        """The Euclidean norm of numbers that are not constant: what the square root of the sum of
+        their squares would record, in one step, since shapes with a norm may be many."""
+        if name != "norm" or literals != (2.0,):
+            return None
+        size = rate = 0.0
+        for value in values:
+            if not isinstance(value, OperationCounter) or value.is_constant:
+                return None
+            base = max(value.size, 1.0)
+            size += min(base * base, _MAX_SIZE)
+            rate += min(2.0 * base * value.rate, _MAX_SIZE)
+        size, rate = min(size, _MAX_SIZE), min(rate, _MAX_SIZE)
+        tally = self.tally
+        tally.operations += len(values) * (_FUNCTION + _SUM) - _SUM
+        return OperationCounter(tally, is_square=True, size=size, rate=rate).norm_of_powers(2.0)
 
     def _note(self, function: ElementaryFunction) -> None:
         """Record in the tally whether this function of this number may jump or be steep. A root of

@@ -418,6 +418,6 @@ def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[flo
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     if len(entries) != 3:
         raise ValueError(f"{name} must be three numbers, not {len(entries)}: {value!r}")
-    check = as_positive if all_positive else as_finite
-    x, y, z = (check(entry, f"each of {name}") for entry in entries)
-    return x, y, z
+    check, each = as_positive if all_positive else as_finite, f"each of {name}"
+    x, y, z = entries
+    return check(x, each), check(y, each), check(z, each)

@@ -18,7 +18,6 @@ from __future__ import annotations
 import os
 import time
 import warnings
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -86,6 +85,8 @@ class CheckpointFolder:
         Raises:
             ValueError: the file is damaged.
         """
+        import zipfile  # imported here: few pictures need it
+
         path = self._file(name)
         if not path.exists():
             return None

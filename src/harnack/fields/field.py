@@ -412,7 +412,8 @@ def is_checked(value: Any) -> bool:
     """Whether a value is a field of the library that refused derivatives when it was made, so that
     it need not be searched for them again."""
     return (
-        isinstance(value, Field)
+        type(value) is not float  # the most frequent type
+        and isinstance(value, Field)
         and not value.traits.has_parameter_derivatives
         and type(value).__module__.startswith("harnack.")
     )

@@ -62,6 +62,8 @@ def _is_choice(value: Any) -> bool:
 def _is_kept(value: Any) -> bool:
     """Whether a value is a number, a path, a volume, a field, a function, a dataclass or a Dr.Jit
     array."""
+    if type(value) in (float, int, tuple):  # the most frequent types
+        return type(value) is not tuple
     kinds = numbers.Number, os.PathLike, Volume, Parametrized
     is_structure = dataclasses.is_dataclass(value) or _is_drjit(value)
     return isinstance(value, kinds) or callable(value) or is_structure
@@ -75,6 +77,18 @@ def _signature(kind: type, maker: str) -> inspect.Signature:
         return inspect.signature(getattr(kind, maker))
     whole = inspect.signature(cast("Any", kind).__init__)
     return whole.replace(parameters=[*whole.parameters.values()][1:])
+
+
+@lru_cache(maxsize=256)
+def _plain_names(kind: type, maker: str) -> tuple[int, tuple[str, ...]]:
+    """How many positional arguments a class method or constructor (`_signature`) needs, and the
+    names of all that it takes, so that calls with these alone, as of the many parts of a model,
+    need not be bound to the signature; (1, ()) if it has parameters of other kinds."""
+    parameters = _signature(kind, maker).parameters.values()
+    if any(p.kind is not inspect.Parameter.POSITIONAL_OR_KEYWORD for p in parameters):
+        return 1, ()
+    required = sum(p.default is inspect.Parameter.empty for p in parameters)
+    return required, tuple(p.name for p in parameters)
 
 
 def record_call(
@@ -91,15 +105,20 @@ def record_call(
     Raises:
         TypeError: the argument `domain` is neither a volume nor None.
     """
-    signature = _signature(cast("Any", type(instance)), maker)
-    try:
-        arguments = dict(signature.bind(*args, **kwargs).arguments)
-    except TypeError:
-        return
-    for name, parameter in signature.parameters.items():
-        # The entries of **kwargs are arguments of their own.
-        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
-            arguments |= arguments.pop(name, {})
+    kind = cast("Any", type(instance))
+    required, names = _plain_names(kind, maker)
+    if not kwargs and required <= len(args) <= len(names):
+        arguments = dict(zip(names, args, strict=False))
+    else:
+        signature = _signature(kind, maker)
+        try:
+            arguments = dict(signature.bind(*args, **kwargs).arguments)
+        except TypeError:
+            return
+        for name, parameter in signature.parameters.items():
+            # The entries of **kwargs are arguments of their own.
+            if parameter.kind is inspect.Parameter.VAR_KEYWORD:
+                arguments |= arguments.pop(name, {})
     check_volume(arguments.get("domain"), "domain")
     vars(instance)["_constructor_call"] = ConstructorCall.of(maker, arguments)
 

@@ -6,6 +6,7 @@ cost of a sample is what is near, and kernels do not depend on the length of the
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -278,21 +279,32 @@ class TapeEvaluator(FormulaEvaluator):
     uploaded: _UploadedTape
 
     @functools.cached_property
-    def _tallies(self) -> tuple[tuple[Tally, float], ...]:
-        """The tallies of the parts of f (`_tallies_of`)."""
-        return tuple(_tallies_of(self.field))
+    def _roughness(self) -> tuple[bool, bool, bool]:
+        """Whether a part of f may jump, may turn abruptly, and may be steep (`_tallies_of`)."""
+        tallies = list(_tallies_of(self.field))
+        is_abrupt = any(tally.turns_within(finest) for tally, finest in tallies)
+        is_steep = is_abrupt or any(tally.is_steep for tally, _ in tallies)
+        return any(tally.may_jump for tally, _ in tallies), is_abrupt, is_steep
 
     @functools.cached_property
     def may_jump(self) -> bool:
-        return any(tally.may_jump for tally, _ in self._tallies)
+        return self._roughness[0]
 
     @property
     def is_abrupt(self) -> bool:
-        return any(tally.turns_within(finest) for tally, finest in self._tallies)
+        return self._roughness[1]
 
     @property
     def is_steep(self) -> bool:
-        return self.is_abrupt or any(tally.is_steep for tally, _ in self._tallies)
+        return self._roughness[2]
+
+    @property
+    def list_margin(self) -> float:
+        """How far from the surface the values of short lists are those of f, as measured: hits
+        within this length are sampled by their lists, others mostly by the whole tape. Infinite
+        without cells."""
+        cells = self.uploaded.cells
+        return math.inf if cells is None else CELL_MARGIN * cells.cell_size
 
     def _with_list(self, formula: Any, radius: Real | None) -> FormulaEvaluator:
         """The evaluator of a formula that is valid within a radius; None for everywhere."""

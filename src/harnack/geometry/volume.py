@@ -45,7 +45,7 @@ class Volume(abc.ABC):
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Make a volume. Raises an error for numbers with derivatives, which would be lost."""
-        check_no_derivatives(cls.__name__, given, named)
+        check_no_derivatives(cls.__name__, *given, *named.values())
         return super().__new__(cls)
 
     def __and__(self, other: object) -> Volume:

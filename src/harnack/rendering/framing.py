@@ -19,6 +19,7 @@ import numpy as np
 from harnack.backend import FloatArray, to_float, to_numpy, to_vector3
 from harnack.fields import Solid
 from harnack.fields.batched_fields import FieldCache, keeps_uploads
+from harnack.fields.tape_evaluator import TapeEvaluator
 from harnack.geometry.volume import as_point
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering.placed_surface import PlacedSurface, Placement
@@ -257,8 +258,12 @@ def _probe(
     """Trace parallel rays to a surface: grid x grid rays from each of the six sides of the box from
     `lower` to `upper`. Returns their first hits (n, 3)."""
     size = float(np.linalg.norm(upper - lower))
-    # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees.
-    rough_surface = replace(surface, tolerance=HitTolerance(1e-3 * size))
+    # A twentieth of the distance between rays; smaller tolerances are slow for sums over trees, and
+    # larger ones for long formulas.
+    tolerance, evaluator = 1e-3 * size, surface.evaluator(backend)
+    if isinstance(evaluator, TapeEvaluator):
+        tolerance = min(tolerance, evaluator.list_margin)
+    rough_surface = replace(surface, tolerance=HitTolerance(tolerance))
     placed = PlacedSurface.of(rough_surface, Placement.identity(), backend)
     # Rays begin and end a hundredth of the size off the box; all of them are traced (`True`).
     o, d, length = _rays(lower, upper, 0.01 * size, grid)

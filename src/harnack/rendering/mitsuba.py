@@ -11,10 +11,12 @@ shortened.
 from __future__ import annotations
 
 import codecs
+import contextlib
+import functools
 import importlib
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +41,8 @@ def load_mitsuba() -> Any:
             vectorized arrays, or tracks polarization.
         LLVMNotFoundError: LLVM is needed, and there is none that Dr.Jit can work with.
     """
-    mi = importlib.import_module("mitsuba")
+    with _syntax_when_called():
+        mi = importlib.import_module("mitsuba")
     if mi.variant() is None:
         variant = f"{choose_backend().name}_ad_rgb"
         if variant not in mi.variants():
@@ -47,7 +50,8 @@ def load_mitsuba() -> Any:
                 f"this Mitsuba has no variant {variant}: set HARNACK_BACKEND=llvm to draw on the "
                 "CPU"
             )
-        mi.set_variant(variant)
+        with _syntax_when_called():
+            mi.set_variant(variant)
     elif _USABLE.fullmatch(mi.variant()) is None:
         raise RuntimeError(
             f"the Mitsuba variant is {mi.variant()}, and surfaces are traced with Dr.Jit arrays "
@@ -66,7 +70,41 @@ def set_variant(variant: str) -> None:
     """
     mi = importlib.import_module("mitsuba")
     if mi.variant() != variant:
-        mi.set_variant(variant)
+        with _syntax_when_called():
+            mi.set_variant(variant)
+
+
+@contextlib.contextmanager
+def _syntax_when_called() -> Generator[None]:
+    """A context in which the decorator `drjit.syntax`, which rewrites the source of a function,
+    does so for functions of Mitsuba only when they are first called.
+
+    Setting a variant defines all of Mitsuba's integrators that are written in Python. They are
+    rarely called, and to rewrite them takes longer than all else of Mitsuba's import.
+    """
+    drjit: Any = dr
+    rewrite: Callable[..., Any] = drjit.syntax
+
+    def syntax(function: Any = None, **options: Any) -> Any:
+        """`drjit.syntax`, put off for functions of Mitsuba."""
+        if function is None:
+            return functools.partial(syntax, **options)
+        if not function.__module__.startswith("mitsuba"):
+            return rewrite(function, **options)
+        rewritten: Callable[[], Any] = functools.cache(lambda: rewrite(function, **options))
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            """Call the function, rewritten."""
+            return rewritten()(*args, **kwargs)
+
+        return call
+
+    drjit.syntax = syntax
+    try:
+        yield
+    finally:
+        drjit.syntax = rewrite
 
 
 def mitsuba_backend(mi: Any) -> Backend:

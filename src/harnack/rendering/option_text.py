@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 from harnack.enclosures.selection import ENCLOSURE_NAMES
-from harnack.fields.expressions import TextFormula
 from harnack.geometry import Ball, Box, HalfSpace, Volume
 from harnack.name_suggestions import did_you_mean
 from harnack.rendering.backdrops import IMAGE_FILES, parse_backdrop
@@ -190,6 +189,8 @@ def parse_section(text: str) -> HalfSpace:
 
 def parse_formula(text: str) -> str:
     """Return the text itself, if it is a formula of x, y and z."""
+    from harnack.fields.expressions import TextFormula  # imported here: few pictures need it
+
     TextFormula.parse(text)
     return text
 

@@ -17,7 +17,6 @@ from harnack.backend import FloatArray
 from harnack.backend.loops import compute_on_active
 from harnack.rendering.isolines import DeviceIsolines, Isolines, isoline_index_at
 from harnack.rendering.surface_hits import CappedSolid, SurfaceHit, intersect_surface
-from harnack.tracer.pixel_cones import PixelCones
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Index, Mask, Real, Vec3
@@ -252,6 +251,8 @@ class PlacedSurface:
 
         The tracer must be one for crossings (`TracedSurface.tracer`).
         """
+        from harnack.tracer.pixel_cones import PixelCones  # imported here: few pictures need it
+
         o, d, t_max = self._local_ray(o, d, t_max)
         solid_range = None if self.solid is None else (self.solid.low, self.solid.high)
         cones = PixelCones(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, cast
@@ -264,7 +265,7 @@ class TapeFormula:
         _, parts, _ = dr.while_loop((start, last, memory), is_running, body, label="tape")
         return _numbers_of_parts(layouts, parts, numbers)
 
-    def _memory(self, layouts: list[_Layout], numbers: list[Any], zero: Real) -> list[Any]:
+    def _memory(self, layouts: list[_Layout], numbers: Sequence[Any], zero: Real) -> list[Any]:
         """Local memory for the parts of results, with the coordinates in their slots. numbers: the
         coordinates of all points."""
         backend = self.program.backend
@@ -352,7 +353,7 @@ def _first(first: list[Real], *_: Any) -> list[Real]:
 
 
 def _numbers_of_parts(
-    layouts: list[_Layout], parts: list[Real], coordinates: list[Any]
+    layouts: list[_Layout], parts: list[Real], coordinates: Sequence[Any]
 ) -> list[Any]:
     """The values for several points from all their parts. coordinates: of the points."""
     values: list[Any] = []
@@ -362,7 +363,7 @@ def _numbers_of_parts(
     return values
 
 
-def _pack(numbers: Sequence[Any]) -> tuple[list[Any], Callable[[list[Any]], list[Any]]]:
+def _pack(numbers: Sequence[Any]) -> tuple[list[Any], Callable[[list[Any]], Sequence[Any]]]:
     """The Dr.Jit arrays in numbers of any arithmetic, each once; and a function that makes the
     numbers of other arrays in their place. What is a Python number stays one, and ends of intervals
     that are the same object stay so: operations with them are shorter."""
@@ -382,13 +383,7 @@ def _pack(numbers: Sequence[Any]) -> tuple[list[Any], Callable[[list[Any]], list
             return type(value), {f.name: note(getattr(value, f.name)) for f in fields(value)}
         return value
 
-    form = note(tuple(numbers))
-
-    def unpack(arrays: list[Any]) -> list[Any]:
-        """The numbers that are made of other arrays."""
-        return list(_rebuilt(form, arrays))
-
-    return arrays, unpack
+    return arrays, _builder(note(tuple(numbers)))
 
 
 @dataclass(frozen=True)
@@ -398,17 +393,22 @@ class _Place:
     index: int
 
 
-def _rebuilt(form: Any, arrays: list[Any]) -> Any:
-    """The value with this form (`_pack`), made of arrays."""
+def _builder(form: Any) -> Callable[[list[Any]], Any]:
+    """A function that makes the value with this form (`_pack`) of arrays. It is called for each
+    operation of each kernel, and so does not look at the form again."""
     if isinstance(form, _Place):
-        return arrays[form.index]
-    if isinstance(form, tuple):
-        entries = cast("tuple[Any, ...]", form)
-        if len(entries) == 2 and isinstance(entries[0], type):
-            attributes = {name: _rebuilt(entry, arrays) for name, entry in entries[1].items()}
-            return entries[0](**attributes)
-        return tuple(_rebuilt(entry, arrays) for entry in entries)
-    return form
+        return operator.itemgetter(form.index)
+    if not isinstance(form, tuple):
+        return lambda _: form
+    entries = cast("tuple[Any, ...]", form)
+    if len(entries) == 2 and isinstance(entries[0], type):
+        kind = cast("Any", entries[0])
+        names, builders = tuple(entries[1]), [_builder(entry) for entry in entries[1].values()]
+        return lambda arrays: kind(
+            **{name: build(arrays) for name, build in zip(names, builders, strict=True)}
+        )
+    builders = [_builder(entry) for entry in entries]
+    return lambda arrays: tuple([build(arrays) for build in builders])
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -226,17 +227,27 @@ class BoxTapes:
     def distinct(self) -> tuple[BoxTapes, IntArray]:
         """The lists without repetitions, of which many boxes have few; and for each box (m,) the
         index of its list among them."""
-        relative = self.operands - self.starts[self.boxes].astype(np.int32)
-        columns = np.column_stack([self.instructions, *relative]).astype(np.int32)
-        text, ends = columns.tobytes(), (self.starts * columns.strides[0]).tolist()
+        starts = np.repeat(self.starts[:-1], self.lengths)
+        columns = [self.instructions, *(self.operands - starts.astype(np.int32))]
+        places = np.arange(len(starts)) - starts
+        keys = np.add.reduceat(_hashes(columns, places), self.starts[:-1])
+        _, first, index = np.unique(keys, return_index=True, return_inverse=True)
+        # Lists keep their order, as neighbors in space have the same ones.
+        order = np.argsort(first)
+        first, index = first[order], np.argsort(order)[index]
+        # Lists that differ may have one key, though hardly ever: all are compared.
+        same = self.starts[:-1][first[index]]
+        is_equal = np.array_equal(self.lengths[first[index]], self.lengths) and all(
+            np.array_equal(column[np.repeat(same, self.lengths) + places], column)
+            for column in columns
+        )
+        if is_equal:
+            return self.subset(first), index
+        rows, ends = np.column_stack(columns).astype(np.int32), self.starts.tolist()
         index_of: dict[bytes, int] = {}
-        first: list[int] = []
-        index = np.empty(len(self), np.int64)
-        for box, (start, end) in enumerate(itertools.pairwise(ends)):
-            index[box] = index_of.setdefault(text[start:end], len(first))
-            if index[box] == len(first):
-                first.append(box)
-        return self.subset(np.array(first, np.int64)), index
+        texts = [rows[start:end].tobytes() for start, end in itertools.pairwise(ends)]
+        index = np.array([index_of.setdefault(text, len(index_of)) for text in texts], np.int64)
+        return self.subset(np.unique(index, return_index=True)[1]), index
 
     @functools.cached_property
     def _groups(self) -> list[tuple[int, EntryArray]]:
@@ -572,3 +583,16 @@ class _SlotLists:
             self.slots[entries] = first
             most = max(most, int(first.max(initial=0)) + 1)
         return most
+
+
+def _hashes(columns: Sequence[EntryArray], places: IntArray) -> npt.NDArray[np.uint64]:
+    """For each entry of lists (n,) a hash of its numbers in all columns and of its place in its
+    list. Sums of the hashes of different lists are different but by chance."""
+    shift, factors = np.uint64(31), (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+    multiply, add, mix = (np.uint64(factor) for factor in factors)
+    hashes = places.astype(np.uint64) * mix
+    for column in columns:
+        hashes += column.astype(np.uint64) * add  # modulo 2^64, as all of this
+        hashes ^= hashes >> shift
+        hashes *= multiply
+    return hashes ^ (hashes >> shift)

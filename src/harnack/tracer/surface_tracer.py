@@ -21,8 +21,6 @@ from harnack.backend.loops import loop_with_queue
 from harnack.enclosures.samples import Ray
 from harnack.fields.capabilities import NO_FACET, NO_PATCH
 from harnack.fields.formula_evaluator import without_alternatives
-from harnack.tracer.branch_tracker import BranchTracker
-from harnack.tracer.jump_tracer import JumpTracer
 from harnack.tracer.level_contact import (
     Contact,
     DeviceHitTolerance,
@@ -32,7 +30,6 @@ from harnack.tracer.level_contact import (
 )
 from harnack.tracer.level_rule import PlainLevels
 from harnack.tracer.march import March, MarchState
-from harnack.tracer.patch_tracer import PatchTracer
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Mask, Real, Vec3
@@ -475,6 +472,8 @@ class SurfaceTracer:
         rule: LevelRule = PlainLevels(self.levels)
         samples, known = self.evaluator.modulo_one, self.known_branch_volume
         if samples is not None and known is not None and not crosses:
+            from harnack.tracer.branch_tracker import BranchTracker  # imported where it is needed
+
             rule = tracker = BranchTracker(self.levels)
             state = tracker.begin(samples, known, path, (t_min, t_max), state)
         march = March(
@@ -569,8 +568,12 @@ class SurfaceTracer:
             """
             to_end = replace(march, ray_end=end)
             if self.evaluator.jumps is not None:
+                from harnack.tracer.jump_tracer import JumpTracer  # imported where it is needed
+
                 return JumpTracer(to_end, self.evaluator.jumps, path, start, end)
             if self.evaluator.patches is not None:
+                from harnack.tracer.patch_tracer import PatchTracer  # imported where it is needed
+
                 return PatchTracer(to_end, self.evaluator.patches, path, start, end, any_hit)
             return SmoothTracer(to_end, self.evaluator, path, end)
 

@@ -397,7 +397,10 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
     empty: (nz, ny, nx) a mask of the empty cells.
     """
     # (SciPy has this transform, but importing `scipy.ndimage` takes a fifth of a second.)
-    distance = np.where(empty, max(empty.shape), 0).astype(np.int32)
+    longest = max(empty.shape)
+    # One larger than the longest distance is computed, too. Bytes stay in the processor's cache.
+    kind = np.uint8 if longest < 255 else np.int32
+    distance = np.where(empty, kind(longest), kind(0))
     # A way of least length goes along x first, then diagonally in x and y or along y, then in all
     # of x, y and z. So sweeps along x, along y and along z find all distances.
     for axis in (2, 1, 0):
@@ -406,7 +409,7 @@ def distance_to_occupied(empty: BoolArray) -> IntArray:
         for step, order in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
             for k in order:
                 before = _least_of_three(planes[k + step], swept)
-                np.minimum(planes[k], before + 1, out=planes[k])
+                np.minimum(planes[k], before + kind(1), out=planes[k])
     return distance.astype(np.int64).ravel()
 
 
