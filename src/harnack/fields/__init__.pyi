@@ -33,6 +33,7 @@ from .solid_angles.screened import ScreenedWindingNumber
 from .solid_angles.solid_angle import SolidAngle
 from .solid_angles.winding_number import WindingNumber
 from .solids.solid import FormulaSolid, Solid
+from .sums import FieldSum
 
 __all__ = [
     "HRBF",
@@ -46,6 +47,7 @@ __all__ = [
     "EvaluateOnly",
     "Evaluator",
     "Field",
+    "FieldSum",
     "Formula",
     "FormulaSolid",
     "FourierSeries",
