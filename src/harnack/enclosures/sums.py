@@ -179,7 +179,7 @@ def _taylor_promises(sample: Sample) -> tuple[Promise, ...]:
     remainders = tuple(entry for entry in sample.promises if isinstance(entry, TaylorRemainder))
     if remainders:
         return remainders
-    error = _value_error(sample)
+    error = value_error(sample)
     return tuple(
         dataclasses.replace(entry, lower=entry.lower - error, upper=entry.upper + error)
         for entry in sample.all_promises
@@ -198,6 +198,23 @@ def _taylor_radii(sample: Sample) -> list[Real] | None:
         elif not _is_unlimited(promise.radius):
             radii.append((1 - _ROUNDING) * promise.radius)
     return radii if promises else None
+
+
+def shared_reach(samples: Sequence[Sample]) -> Real:
+    """Return the largest length on which all of several functions have a bound of Taylor's
+    remainder, or else a Lipschitz constant; infinite, as a Python number, if nothing limits it."""
+    reaches: list[Real] = []
+    for sample in samples:
+        radii = _taylor_radii(sample)
+        if radii is None:
+            promise = lipschitz_promise(sample)
+            radii = [] if promise is None else [promise.radius]
+        for k, radius in enumerate(radii):
+            if k == 0:
+                reaches.append(radius)
+            else:
+                reaches[-1] = fmax(radius, reaches[-1])
+    return least([dr.inf, *reaches])
 
 
 def _harmonic_ball(terms: Sequence[Sample]) -> HarmonicBall | None:
@@ -230,7 +247,7 @@ def _narrowed(ball: HarmonicBall, radius: Real, sample: Sample) -> HarmonicBall:
     (1+q)^(n-1) and u(p) (1+q)/(1-q)^(n-1) on the smaller ball, by Harnack's inequality; and
     likewise upper - f. The error of f(p), and the rounding of these formulas, widen the range.
     """
-    error, n = _value_error(sample), ball.dimension
+    error, n = value_error(sample), ball.dimension
     q = fmin(radius / ball.radius * (1 + _ROUNDING), 1)
     least_factor, greatest_factor = (1 - q), (1 + q)
     for _ in range(n - 1):
@@ -317,7 +334,7 @@ def lipschitz_promise(sample: Sample) -> Lipschitz | None:
     return None
 
 
-def _value_error(sample: Sample) -> Real:
+def value_error(sample: Sample) -> Real:
     """Return a bound of the error of the value of a sample, with the rounding that it leaves
     out."""
     epsilon = 2 * float(dr.epsilon(type(sample.value)))

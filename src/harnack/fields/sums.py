@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, cast
@@ -17,15 +17,19 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, to_numpy
+from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, tensor_to_array
 from harnack.backend.validation import as_finite, format_short
 from harnack.enclosures import Lipschitz
 from harnack.enclosures.extremum import NegatedEnclosure, ScaledEnclosure
+from harnack.enclosures.parabola_arithmetic import RayFunction, summed_enclosure, summed_slope
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.enclosures.sums import summed_sample, weighted_sample
+from harnack.enclosures.sums import shared_reach, summed_sample, weighted_sample
 from harnack.fields.capabilities import Boundary, VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits, check_is_field
+from harnack.fields.formula import Formula, has_own_formula, own_formula
+from harnack.fields.formula_evaluator import FormulaEvaluator
 from harnack.geometry.clip_volumes import VolumeIntersection
 from harnack.name_suggestions import with_article
 
@@ -152,6 +156,51 @@ class FieldSum(Field):
 
 
 @dataclass(frozen=True, eq=False)
+class FormulaSum(Formula):
+    """The sum w_1 f_1 + ... + w_n f_n + c of formulas, which is a formula.
+
+    terms: the formulas f_i.
+    weights, constant: the numbers w_i and c.
+
+    Raises:
+        TypeError, ValueError: a number that is not finite.
+    """
+
+    terms: tuple[Field, ...]
+    weights: tuple[float, ...]
+    constant: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Set what follows from the terms: the domain, the default level, the traits and the
+        Lipschitz constant."""
+        levels = [term.default_level for term in self.terms]
+        constants = [cast("Any", term).lipschitz for term in self.terms]
+        weights = tuple(as_finite(weight, "weights") for weight in self.weights)
+        for name, value in (
+            ("weights", weights),
+            ("constant", as_finite(self.constant, "constant")),
+            ("domain", common_domain(self.terms)),
+            ("default_level", float(np.dot(weights, levels))),
+            ("traits", common_traits(self.terms)),
+            (
+                "lipschitz",
+                None if None in constants else float(np.dot(np.abs(weights), constants)),
+            ),
+            (
+                "is_convex",
+                min(weights) >= 0 and all(cast("Any", term).is_convex for term in self.terms),
+            ),
+        ):
+            object.__setattr__(self, name, value)
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        total: Any = self.constant
+        for term, weight in zip(self.terms, self.weights, strict=True):
+            total = own_formula(term)(x, y, z) * weight + total
+        return total
+
+
+@dataclass(frozen=True, eq=False)
 class _Term:
     """A term of a sum on a backend.
 
@@ -261,11 +310,32 @@ class SumEvaluator(Evaluator):
         sampled = self._sampled
         if len(sampled) == 1:
             return self._single_ray(path, t, ahead, back)
-        p = path.point(t)
         if not sampled:
-            return path.enclose(self._sum([], p))
-        samples = [term.evaluator.sample_ray(path, t, ahead, back).sample for term in sampled]
-        return path.enclose(self._sum(samples, p))
+            return path.enclose(self._sum([], path.point(t)))
+        evaluators = [term.evaluator for term in sampled]
+        ray_samples = sample_rays(evaluators, path, t, ahead, back)
+        sample = self._sum([entry.sample for entry in ray_samples], path.point(t))
+        weighted = [
+            (term, term.sample(entry.sample), entry)
+            for term, entry in zip(sampled, ray_samples, strict=True)
+        ]
+        functions = [
+            RayFunction.ahead(entry).weighted(term.weight, part) for term, part, entry in weighted
+        ]
+        if not any(function.has_ranges for function in functions):
+            return path.enclose(sample)
+        length = fmin(shared_reach([part for _, part, _ in weighted]), ahead)
+        forward = summed_enclosure(functions, length)
+        if forward is None:
+            raise ValueError(nothing_known_message(evaluators, functions))
+        behind = [
+            RayFunction.behind(entry).weighted(term.weight, part) for term, part, entry in weighted
+        ]
+        backward = summed_enclosure(behind, fmin(length, back))
+        slope, error = summed_slope([f.slopes for f in functions])
+        growth = max(entry.reach_growth for entry in ray_samples)
+        backwards = () if backward is None else (backward,)
+        return RaySample(sample, (forward,), backwards, slope, growth, error)
 
     def _single_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The ray sample of a sum with a single term whose weight is not 0."""
@@ -326,6 +396,43 @@ class SumEvaluator(Evaluator):
         return value
 
 
+def sample_rays(
+    evaluators: Sequence[Evaluator], path: Ray, t: Real, ahead: Real, back: Real
+) -> list[RaySample]:
+    """The ray samples of several functions at the points of rays with parameter t. Ranges of
+    formulas are computed on lengths on which bounds of all other functions hold, because longer
+    ones would be less sharp.
+
+    path, ahead, back: as of `Evaluator.sample_ray`.
+    """
+    samples: dict[int, RaySample] = {}
+    is_formula = [isinstance(evaluator, FormulaEvaluator) for evaluator in evaluators]
+    for k, evaluator in enumerate(evaluators):
+        if not is_formula[k]:
+            samples[k] = evaluator.sample_ray(path, t, ahead, back)
+    length = fmin(shared_reach([entry.sample for entry in samples.values()]), ahead)
+    for k, evaluator in enumerate(evaluators):
+        if is_formula[k]:
+            samples[k] = evaluator.sample_ray(path, t, length, back)
+    return [samples[k] for k in range(len(evaluators))]
+
+
+def nothing_known_message(
+    evaluators: Sequence[Evaluator], functions: Sequence[RayFunction]
+) -> str:
+    """The text of an error: of one of several functions nothing is known along a ray with which
+    bounds of sums and products are made."""
+    names = [
+        evaluator.name
+        for evaluator, function in zip(evaluators, functions, strict=True)
+        if function.parabola(1.0) is None
+    ]
+    return (
+        f"{' and '.join(names)} promises neither a harmonic ball, nor a bound of the second "
+        "derivatives, nor a Lipschitz constant, so that no bound of a sum or product follows"
+    )
+
+
 # Operators.
 
 
@@ -342,6 +449,8 @@ def added(field: Any, other: Any, *, sign: float = 1.0) -> Field:
             return cast("Any", NotImplemented)
         parts = _parts_of(field)
         return make_sum(parts.terms, parts.weights, parts.constant + sign * as_number(other))
+    if has_own_operators(other):
+        return cast("Any", NotImplemented)
     first, second = _parts_of(field), _parts_of(other)
     weights = (*first.weights, *(sign * weight for weight in second.weights))
     return make_sum(
@@ -394,6 +503,8 @@ class _Parts:
 
 def _parts_of(field: Field) -> _Parts:
     """The terms of a field that is a sum; the field itself as the only term of all others."""
+    if isinstance(field, FormulaSum):
+        return _Parts(field.terms, field.weights, field.constant)
     if type(field) is FieldSum:
         weights = _separate_weights(field.weights, len(field.terms))
         return _Parts(field.terms, weights, field.constant)
@@ -406,8 +517,21 @@ def make_sum(terms: tuple[Field, ...], weights: tuple[Any, ...], constant: Any) 
     for term, weight in zip(terms, weights, strict=True):
         _, known = by_field.get(id(term), (term, 0.0))
         by_field[id(term)] = term, known + weight
-    pairs = tuple(by_field.values())
-    return FieldSum([term for term, _ in pairs], [weight for _, weight in pairs], constant)
+    terms = tuple(term for term, _ in by_field.values())
+    weights = tuple(weight for _, weight in by_field.values())
+    if are_formulas(terms) and all(isinstance(n, float) for n in (*weights, constant)):
+        return FormulaSum(terms, weights, constant)
+    return FieldSum(terms, weights, constant)
+
+
+def are_formulas(fields: Iterable[Field]) -> bool:
+    """Whether all fields have formulas, so that what is computed of them is a formula, too."""
+    return all(isinstance(field, Formula) and has_own_formula(field) for field in fields)
+
+
+def has_own_operators(field: Field) -> bool:
+    """Whether a field has operators of its own, as solids have."""
+    return type(field).__radd__ is not Field.__radd__
 
 
 def is_number(value: Any) -> bool:
