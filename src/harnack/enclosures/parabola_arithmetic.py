@@ -266,23 +266,32 @@ def multiplied_enclosure(f: RayFunction, g: RayFunction, length: Real) -> Enclos
     Proof. Let F and G be the changes of f and g. The change of the product is f G + g F + F G, with
     f and g at the start. For s <= r, F(s) = s A with A between the least a + c u/2 and the largest
     b + d u/2 for 0 <= u <= r, which are reached at u = 0 or u = r; likewise G(s) = s B. So F G is
-    (2 A B) s^2/2. The ranges of f and g contain the errors of their values.
+    (2 A B) s^2/2. The ranges of f and g contain the errors of their values. Bounds of F and G that
+    follow from promises hold up to these errors, which in F G are multiplied by at most s B and s
+    A: they widen the slopes.
     """
     first, second = f.parabola(length), g.parabola(length)
     if first is None or second is None:
         return None
     reach = _shortest([length, first.reach, second.reach])
     f_value, g_value = _value_range(f.sample), _value_range(g.sample)
+    f_mean, g_mean = _mean_slopes(first, reach), _mean_slopes(second, reach)
+    product = f_mean * g_mean
     slopes = f_value * _slopes(second) + g_value * _slopes(first)
-    product = _mean_slopes(first, reach) * _mean_slopes(second, reach)
+    slopes = slopes + _error_range(f.sample) * g_mean + _error_range(g.sample) * f_mean
     seconds = f_value * _seconds(second) + g_value * _seconds(first) + (product + product)
     return _parabola(slopes, seconds, reach)
 
 
 def _value_range(sample: Sample) -> Interval:
     """The range of the value of a sample, with its whole error."""
+    return Interval.point(sample.value) + _error_range(sample)
+
+
+def _error_range(sample: Sample) -> Interval:
+    """The interval of all errors that the value of a sample may have."""
     error = value_error(sample)
-    return Interval.point(sample.value) + Interval(-error, error)
+    return Interval(-error, error)
 
 
 def _slopes(parabola: ParabolaEnclosure) -> Interval:

@@ -30,13 +30,13 @@ P = TypeVar("P", bound=Promise)
 
 # A bound that is computed in some ten roundings of single precision is raised, and a radius
 # lowered, by this fraction.
-_ROUNDING = 2e-6
+PROOF_ROUNDING = 2e-6
 # The radii on which Taylor's remainder of a harmonic function is bounded, as fractions of the
 # radius of its ball, by experiment.
 _SHARES = (0.25, 0.5)
 # Of the rounding error of a value, `Sample.value_error` leaves out this number of units in the last
 # place; and that of a gradient is left out if it is that of a few operations, at most so many.
-_ROUNDINGS_LEFT_OUT = 8.0
+ROUNDINGS_LEFT_OUT = 8.0
 
 
 def weighted_sample(sample: Sample, weight: Real, *, is_negative: bool, is_exact: bool) -> Sample:
@@ -81,7 +81,7 @@ def summed_sample(terms: Sequence[Sample], constant: Real) -> Sample:
     """
     if len(terms) == 1:
         (term,), size = terms, dr.abs(terms[0].value) + dr.abs(constant)
-        rounding = (_ROUNDINGS_LEFT_OUT + 1) * 2 * float(dr.epsilon(type(size)))
+        rounding = (ROUNDINGS_LEFT_OUT + 1) * 2 * float(dr.epsilon(type(size)))
         moved = term.shifted(constant)
         return dataclasses.replace(moved, value_error=term.value_error + rounding * size)
     value, gradient = terms[0].value, terms[0].gradient
@@ -92,7 +92,7 @@ def summed_sample(terms: Sequence[Sample], constant: Real) -> Sample:
         gradient_size = gradient_size + safe_norm(term.gradient)
     value, value_size = value + constant, value_size + dr.abs(constant)
     epsilon = 2 * float(dr.epsilon(type(value)))
-    roundings = _ROUNDINGS_LEFT_OUT + len(terms) + 1
+    roundings = ROUNDINGS_LEFT_OUT + len(terms) + 1
     # Numbers below the smallest normal one may underflow to 0.
     underflow = roundings * len(terms) * float(dr.smallest(type(value)))
     promises, alternatives = summed_promises(terms)
@@ -139,23 +139,34 @@ def taylor_remainders(terms: Sequence[Sample]) -> tuple[TaylorRemainder, ...]:
 
     The radii are those of the terms: the first one is the smallest of their first ones, and so on.
     """
-    radii = [_taylor_radii(term) for term in terms]
-    if any(entry is None for entry in radii):
+    radii = shared_radii(terms)
+    if radii is None:
         return ()
-    # A term whose only bound holds everywhere limits no radius.
-    limited = [entry for entry in radii if entry]
-    if not limited:
+    if not radii:
         promises = [cast("Any", _first(term.promises, TaylorRemainder)) for term in terms]
         constant = total([promise.constant for promise in promises])
         cubic = total([promise.cubic_constant for promise in promises])
-        factor = 1 + _ROUNDING
+        factor = 1 + PROOF_ROUNDING
         return (TaylorRemainder(constant * factor, cubic_constant=cubic * factor),)
-    remainders: list[TaylorRemainder] = []
-    for k in range(max(map(len, limited))):
-        radius = least([entry[min(k, len(entry) - 1)] for entry in limited])
-        constant = total([taylor_constant(term, radius) for term in terms])
-        remainders.append(TaylorRemainder(constant * (1 + _ROUNDING), radius))
-    return tuple(remainders)
+    return tuple(
+        TaylorRemainder(
+            total([taylor_constant(term, radius) for term in terms]) * (1 + PROOF_ROUNDING), radius
+        )
+        for radius in radii
+    )
+
+
+def shared_radii(samples: Sequence[Sample]) -> list[Real] | None:
+    """Return radii of balls on which Taylor's remainders of several functions are bounded: the
+    smallest of their first radii, of their second ones, and so on. An empty list if one bound of
+    each holds everywhere; None if there is none of a function."""
+    radii = [_taylor_radii(sample) for sample in samples]
+    if any(entry is None for entry in radii):
+        return None
+    # A function whose only bound holds everywhere limits no radius.
+    limited = [entry for entry in radii if entry]
+    count = max(map(len, limited), default=0)
+    return [least([entry[min(k, len(entry) - 1)] for entry in limited]) for k in range(count)]
 
 
 def taylor_constant(sample: Sample, radius: Real) -> Real:
@@ -167,7 +178,7 @@ def taylor_constant(sample: Sample, radius: Real) -> Real:
             bound = dr.select(radius < promise.radius, promise.constant, dr.inf)
         else:
             remainder = promise.taylor_remainder_bound(sample.value, radius)
-            bound = 2 * (remainder / radius) / radius * (1 + _ROUNDING)
+            bound = 2 * (remainder / radius) / radius * (1 + PROOF_ROUNDING)
         constant = fmin(bound, constant)
     return constant
 
@@ -196,7 +207,7 @@ def _taylor_radii(sample: Sample) -> list[Real] | None:
         if not isinstance(promise, TaylorRemainder):
             radii += [share * promise.radius for share in _SHARES]
         elif not _is_unlimited(promise.radius):
-            radii.append((1 - _ROUNDING) * promise.radius)
+            radii.append((1 - PROOF_ROUNDING) * promise.radius)
     return radii if promises else None
 
 
@@ -248,7 +259,7 @@ def _narrowed(ball: HarmonicBall, radius: Real, sample: Sample) -> HarmonicBall:
     likewise upper - f. The error of f(p), and the rounding of these formulas, widen the range.
     """
     error, n = value_error(sample), ball.dimension
-    q = fmin(radius / ball.radius * (1 + _ROUNDING), 1)
+    q = fmin(radius / ball.radius * (1 + PROOF_ROUNDING), 1)
     least_factor, greatest_factor = (1 - q), (1 + q)
     for _ in range(n - 1):
         least_factor, greatest_factor = least_factor / (1 + q), greatest_factor / (1 - q)
@@ -261,8 +272,8 @@ def _narrowed(ball: HarmonicBall, radius: Real, sample: Sample) -> HarmonicBall:
             return None
         u = fmax(sign * (end - sample.value), 0) + error
         towards, away = u * (1 - least_factor), u * (greatest_factor - 1)
-        slack = _ROUNDING * u + error
-        return towards + slack, away * (1 + 4 * _ROUNDING) + slack
+        slack = PROOF_ROUNDING * u + error
+        return towards + slack, away * (1 + 4 * PROOF_ROUNDING) + slack
 
     fall, rise = moved(ball.lower, -1.0), moved(ball.upper, 1.0)
     lower, upper = ball.lower, ball.upper
@@ -305,7 +316,7 @@ def _lipschitz(terms: Sequence[Sample]) -> Lipschitz | None:
     if len(known) < len(terms):
         return None
     constant = total([promise.constant for promise in known])
-    return Lipschitz(constant * (1 + _ROUNDING), least([promise.radius for promise in known]))
+    return Lipschitz(constant * (1 + PROOF_ROUNDING), least([promise.radius for promise in known]))
 
 
 def lipschitz_promise(sample: Sample) -> Lipschitz | None:
@@ -327,7 +338,7 @@ def lipschitz_promise(sample: Sample) -> Lipschitz | None:
                 constant = 1.5 * slope
             else:
                 constant = dr.fma(0.5 * radius, promise.constant, slope)
-            return Lipschitz(constant * (1 + _ROUNDING), radius)
+            return Lipschitz(constant * (1 + PROOF_ROUNDING), radius)
         implied = promise.implied_lipschitz(sample.value)
         if implied is not None:
             return implied
@@ -338,7 +349,7 @@ def value_error(sample: Sample) -> Real:
     """Return a bound of the error of the value of a sample, with the rounding that it leaves
     out."""
     epsilon = 2 * float(dr.epsilon(type(sample.value)))
-    return dr.fma(_ROUNDINGS_LEFT_OUT * epsilon, dr.abs(sample.value), sample.value_error)
+    return dr.fma(ROUNDINGS_LEFT_OUT * epsilon, dr.abs(sample.value), sample.value_error)
 
 
 def _first(promises: Sequence[Promise], kind: Callable[..., P]) -> P | None:

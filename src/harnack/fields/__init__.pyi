@@ -32,6 +32,7 @@ from .solid_angles.polygon_mesh import PolygonMesh
 from .solid_angles.screened import ScreenedWindingNumber
 from .solid_angles.solid_angle import SolidAngle
 from .solid_angles.winding_number import WindingNumber
+from .products import FieldProduct
 from .solids.solid import FormulaSolid, Solid
 from .sums import FieldSum
 
@@ -47,6 +48,7 @@ __all__ = [
     "EvaluateOnly",
     "Evaluator",
     "Field",
+    "FieldProduct",
     "FieldSum",
     "Formula",
     "FormulaSolid",

@@ -46,9 +46,15 @@ class FieldOperators:
         return multiplied(self, -1.0)
 
     def __mul__(self, other: Any) -> Field:
-        from harnack.fields.sums import multiplied
+        from harnack.fields.field import Field
+        from harnack.fields.products import make_product
+        from harnack.fields.sums import has_own_operators, multiplied
 
-        return multiplied(self, other)
+        if not isinstance(other, Field):
+            return multiplied(self, other)
+        if has_own_operators(other):
+            return cast("Any", NotImplemented)
+        return make_product(cast("Any", self), other)
 
     __rmul__ = __mul__
 

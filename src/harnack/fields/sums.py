@@ -79,7 +79,7 @@ class FieldSum(Field):
         if not entries:
             raise ValueError("give at least one term")
         for term in entries:
-            _check_term(term)
+            check_term(term)
         self.terms: tuple[Field, ...] = entries
         self.weights = _checked_weights(weights, len(entries))
         self.constant = _checked_number(constant, "constant")
@@ -110,7 +110,7 @@ class FieldSum(Field):
             return None
         if len(self.terms) == 1:
             return _weighted_boundary(boundaries[0], known[0][1])
-        return _joined_boundary(boundaries)
+        return joined_boundary(boundaries)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that contains the level sets: of a single term, that of its own level sets; else
@@ -555,7 +555,7 @@ def as_number(value: Any) -> Any:
 # Arguments.
 
 
-def _check_term(term: Any) -> None:
+def check_term(term: Any) -> None:
     """Raise an error if a field cannot be a term of a sum or a factor of a product."""
     check_is_field(term)
     name = with_article(type(term).__name__)
@@ -712,7 +712,7 @@ def _weighted_boundary(boundary: Boundary, weight: float) -> Boundary:
     return dataclasses.replace(boundary, continuous_change=weighted_change)
 
 
-def _joined_boundary(boundaries: list[Boundary]) -> Boundary:
+def joined_boundary(boundaries: list[Boundary]) -> Boundary:
     """The curves and points of several boundaries."""
     points = [entry.points for entry in boundaries if entry.points is not None]
     closest = [entry.closest_point for entry in boundaries if entry.closest_point is not None]
