@@ -1,5 +1,5 @@
-"""Sums and products of functions along a ray, from enclosures of the functions between parabolas. An
-enclosure bounds how far a function can change along the ray from its value at a sample.
+"""Sums and products of functions along a ray, from enclosures of the functions between parabolas.
+An enclosure bounds how far a function can change along the ray from its value at a sample.
 
 The change of a function f along the ray is F(s), at the length s beyond the sample. A
 `ParabolaEnclosure` states for lengths s up to its reach
@@ -35,7 +35,8 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class RayFunction:
-    """A function f along a ray: what is known of it in front of the point of a sample, or behind it.
+    """A function f along a ray: what is known of it in front of the point of a sample, or behind
+    it.
 
     sample: the sample of f at the point.
     slopes: the range of the derivative of f along the direction at the point.

@@ -6,7 +6,7 @@ functions is harmonic; so its proofs are those of its terms, with bounds that ar
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import drjit as dr
@@ -100,7 +100,8 @@ def summed_sample(terms: Sequence[Sample], constant: Real) -> Sample:
         value,
         gradient,
         tuple(promise.shifted(constant) for promise in promises),
-        total([term.value_error for term in terms]) + (roundings * epsilon * value_size + underflow),
+        total([term.value_error for term in terms])
+        + (roundings * epsilon * value_size + underflow),
         total([term.gradient_error for term in terms]) + roundings * epsilon * gradient_size,
         truncation_error=total([term.truncation_error for term in terms]),
         alternative_promises=tuple(promise.shifted(constant) for promise in alternatives),
@@ -352,9 +353,9 @@ def value_error(sample: Sample) -> Real:
     return dr.fma(ROUNDINGS_LEFT_OUT * epsilon, dr.abs(sample.value), sample.value_error)
 
 
-def _first(promises: Sequence[Promise], kind: Callable[..., P]) -> P | None:
+def _first(promises: Sequence[Promise], kind: type[P]) -> P | None:
     """Return the first promise of a kind; None if there is none."""
-    return next((entry for entry in promises if isinstance(entry, cast("Any", kind))), None)
+    return next((entry for entry in promises if isinstance(entry, kind)), None)
 
 
 def total(numbers: Sequence[Real]) -> Real:

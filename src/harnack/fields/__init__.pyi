@@ -26,13 +26,13 @@ from .expressions import expression
 from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator, Traits
 from .formula import Formula
 from .networks.network import Network
+from .products import FieldProduct
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
 from .solid_angles.polygon_mesh import PolygonMesh
 from .solid_angles.screened import ScreenedWindingNumber
 from .solid_angles.solid_angle import SolidAngle
 from .solid_angles.winding_number import WindingNumber
-from .products import FieldProduct
 from .solids.solid import FormulaSolid, Solid
 from .sums import FieldSum
 

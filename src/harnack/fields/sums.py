@@ -6,8 +6,10 @@ is sampled by samples of its terms: values and derivatives are added, and so are
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import numbers
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -18,23 +20,26 @@ import numpy as np
 
 from harnack.backend import backend_of, to_numpy
 from harnack.backend.elementary import fmin
-from harnack.backend.tensors import is_tensor, tensor_to_array
+from harnack.backend.tensors import accepts_tensors, is_tensor, tensor_to_array
 from harnack.backend.validation import as_finite, format_short
+from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import Lipschitz
 from harnack.enclosures.extremum import NegatedEnclosure, ScaledEnclosure
 from harnack.enclosures.parabola_arithmetic import RayFunction, summed_enclosure, summed_slope
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.enclosures.sums import shared_reach, summed_sample, weighted_sample
 from harnack.fields.capabilities import Boundary, VariableAccuracy
+from harnack.fields.clearance import bounded_side_extent
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits, check_is_field
 from harnack.fields.formula import Formula, has_own_formula, own_formula
 from harnack.fields.formula_evaluator import FormulaEvaluator
-from harnack.geometry.clip_volumes import VolumeIntersection
+from harnack.fields.parameters import differentiable_parameters
+from harnack.geometry.clip_volumes import VolumeIntersection, box_around_volumes
 from harnack.name_suggestions import with_article
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Precision, Real, Vec3
     from harnack.enclosures import Enclosure
     from harnack.geometry import Volume
     from harnack.tree.empty_space import OccupancyGrid
@@ -55,7 +60,8 @@ class FieldSum(Field):
     constant: the number c, which may be a Dr.Jit number.
 
     The domain is the intersection of the domains of the terms. The default level is the sum of
-    theirs, times the weights; the constant does not move it.
+    theirs, times the weights; the constant does not move it. If that is a multiple of the period,
+    half the period is added, since such a level set extends to infinity.
 
     If one term is angle-valued with the period P, the sum has the period |w| P. Of several such
     terms it has the largest period of which all |w_i| P_i are multiples; so their weights are
@@ -87,10 +93,14 @@ class FieldSum(Field):
         self._constant_number = _host_number(self.constant)
         for number in (*self._weight_numbers, self._constant_number):
             as_finite(number, "weights and constant")
-        self.period = _common_period(entries, self.weights, self._weight_numbers)
+        period = _common_period(entries, self.weights, self._weight_numbers)
+        object.__setattr__(self, "period", period)  # of the instance, in place of the class's
         self.domain = common_domain(entries)
         levels = [term.default_level for term in entries]
-        self.default_level = float(np.dot(self._weight_numbers, levels))
+        level = float(np.dot(self._weight_numbers, levels))
+        if self.period is not None and abs(math.remainder(level, self.period)) < 1e-6 * self.period:
+            level += 0.5 * self.period  # the value far away has no bounded level set
+        self.default_level = level
         self.traits = dataclasses.replace(
             common_traits(entries),
             is_larger_inside=all(
@@ -105,7 +115,7 @@ class FieldSum(Field):
         """The curves and points at which the level sets of any term end; None if there are none."""
         pairs = zip(self.terms, self._weight_numbers, strict=True)
         known = [(t.boundary, w) for t, w in pairs if w != 0 and t.boundary is not None]
-        boundaries = [cast("Boundary", boundary) for boundary, _ in known]
+        boundaries = [boundary for boundary, _ in known]
         if not boundaries:
             return None
         if len(self.terms) == 1:
@@ -113,12 +123,44 @@ class FieldSum(Field):
         return joined_boundary(boundaries)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets: of a single term, that of its own level sets; else
-        the domain."""
+        """A volume that contains the level sets: of a single term, that of its own level sets; of
+        several terms, the domain or, without a domain, a box around volumes that are proved for
+        each of them (`_extents_of_terms`)."""
         inner = self._levels_of_single(levels)
-        if inner is None:
+        if inner is not None:
+            return self.terms[0].extent(inner)
+        if self.domain is not None:
             return self.domain
-        return self.terms[0].extent(inner)
+        volumes = [volume for level in levels for volume in self._extents_of_terms(level)]
+        known = [volume for volume in volumes if volume is not None]
+        return box_around_volumes(known) if known and len(known) == len(volumes) else None
+
+    def _extents_of_terms(self, level: float) -> list[Volume | None]:
+        """Volumes that together contain the level set of a level; None among them if one is not
+        known, as for terms that do not fall off with the distance.
+
+        Proof. Let g be the difference between the level and the constant. Where the sum of n terms
+        takes the level, one of the w_i f_i is at least g/n, if g > 0; at most g/n, if g < 0. If a
+        term is angle-valued, g is reduced by the nearest multiple of the period, and one of the w_i
+        f_i differs from each multiple of its own period by at least |g|/n: otherwise the sum would
+        differ from a multiple of the period by less than |g|. Where a term has such values, it has
+        these levels, or is on one side of them (`bounded_side_extent`).
+        """
+        pairs = zip(self.terms, self._weight_numbers, strict=True)
+        used = [(term, weight) for term, weight in pairs if weight != 0]
+        gap = level - self._constant_number
+        if self.period is not None:
+            gap = math.remainder(gap, self.period)
+        if gap == 0 or not used:
+            return [None]
+        distance_of_all = abs(gap) / len(used)
+        sign = None if self.period is not None else math.copysign(1.0, gap)
+        return [
+            _far_from_zero(term, weight, distance_of_all, sign)
+            for term, weight in used
+            # Otherwise no value differs so much from the nearest multiple of the period.
+            if term.period is None or distance_of_all <= abs(weight) * 0.5 * term.period
+        ]
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         inner = self._levels_of_single(levels)
@@ -137,6 +179,33 @@ class FieldSum(Field):
         """The number of terms, as a dictionary for users."""
         return {"terms": len(self.terms)}
 
+    @accepts_dask_arrays("points")
+    @accepts_tensors
+    def value(self, points: Any, *, precision: Precision | None = None) -> Any:
+        """The values (n,) of the sum at points (n, 3), as of `Field.value`: those of the terms,
+        times their weights, added up. An angle-valued sum is reduced by its period only as far as
+        its terms are."""
+        if carries_derivatives(self, points):
+            return super().value(points, precision=precision)
+        values = (term.value(points, precision=precision) for term in self.terms)
+        return self._weighted_total(values) + self._constant_number
+
+    @accepts_dask_arrays("points")
+    @accepts_tensors
+    def gradient(self, points: Any, *, precision: Precision | None = None) -> Any:
+        """The gradients (n, 3) of the sum at points (n, 3), as of `Field.gradient`: those of the
+        terms, times their weights, added up."""
+        if carries_derivatives(self, points):
+            return super().gradient(points, precision=precision)
+        return self._weighted_total(
+            term.gradient(points, precision=precision) for term in self.terms
+        )
+
+    def _weighted_total(self, numbers: Iterable[Any]) -> Any:
+        """The sum of numbers or vectors, one for each term, times the weights of the terms."""
+        products = [n * w for n, w in zip(numbers, self._weight_numbers, strict=True)]
+        return functools.reduce(operator.add, products)
+
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> SumEvaluator:
         levels = self._levels_of_single(plan.levels) or ()
         inner_plan = Plan(levels, plan.ray_count)
@@ -153,6 +222,29 @@ class FieldSum(Field):
         moved_constant = _device_number(self.constant, backend)
         constant = dr.opaque(backend.Float, self._constant_number)
         return SumEvaluator(terms, constant, self._constant_number != 0, moved_constant)
+
+
+def carries_derivatives(field: Field, points: Any) -> bool:
+    """Whether points or parameters of a field are Dr.Jit arrays with derivatives enabled."""
+    arrays = (points, *differentiable_parameters(field))
+    return any(dr.is_array_v(cast("Any", type(a))) and dr.grad_enabled(a) for a in arrays)
+
+
+def _far_from_zero(
+    field: Field, weight: float, distance: float, sign: float | None
+) -> Volume | None:
+    """A volume that contains all points at which weight * f is at least `distance`, for the sign 1,
+    or at most -distance, for the sign -1. For the sign None, both; and for an angle-valued f, those
+    at which it differs from each multiple of its period by so much. None if none is known."""
+    period = math.inf if field.period is None else abs(weight) * field.period
+
+    def is_far(value: float) -> bool:
+        """Whether points at which f is `value` are among those."""
+        weighted = math.remainder(weight * value, period)
+        return (abs(weighted) if sign is None else sign * weighted) >= distance
+
+    signs = (1.0, -1.0) if sign is None else (sign,)
+    return bounded_side_extent(field, tuple(s * distance / weight for s in signs), is_far)
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,9 +509,7 @@ def sample_rays(
     return [samples[k] for k in range(len(evaluators))]
 
 
-def nothing_known_message(
-    evaluators: Sequence[Evaluator], functions: Sequence[RayFunction]
-) -> str:
+def nothing_known_message(evaluators: Sequence[Evaluator], functions: Sequence[RayFunction]) -> str:
     """The text of an error: of one of several functions nothing is known along a ray with which
     bounds of sums and products are made."""
     names = [
@@ -453,9 +543,7 @@ def added(field: Any, other: Any, *, sign: float = 1.0) -> Field:
         return cast("Any", NotImplemented)
     first, second = _parts_of(field), _parts_of(other)
     weights = (*first.weights, *(sign * weight for weight in second.weights))
-    return make_sum(
-        (*first.terms, *second.terms), weights, first.constant + sign * second.constant
-    )
+    return make_sum((*first.terms, *second.terms), weights, first.constant + sign * second.constant)
 
 
 def multiplied(field: Any, factor: Any) -> Field:

@@ -29,7 +29,6 @@ from harnack.testing.violation_search import (
     accumulated_jumps,
     require,
     sample_field,
-    to_lanes,
 )
 
 if TYPE_CHECKING:
@@ -466,9 +465,8 @@ def _check_hessian(
     the spacing for the gradient is far too small for second derivatives.
     """
     backend = choose_backend("double")
-    evaluator, p = field.evaluator(backend), to_vector3(backend, points, "points")
     try:
-        rows = evaluator.hessian(p)
+        rows = field.evaluator(backend).hessian(to_vector3(backend, points, "points"))
     except NotImplementedError:
         return
     n = len(points)
@@ -483,12 +481,9 @@ def _check_hessian(
     if _is_harmonic(samples):
         trace = np.abs(np.trace(hessian, axis1=1, axis2=2))
         require(trace <= 1e-9 * size, "f is harmonic, but its Hessian has a trace", points, trace)
-    hessian_error: Any = 0.0  # its truncation error may differ from that of the gradient
+    hessian_error = 0.0  # its truncation error may differ from that of the gradient
     if isinstance(field, BatchedField):
         hessian_error = field.hessian_error_bound(points, precision="double")
-    elif evaluator.variable_accuracy is not None:  # a combination of such fields
-        bound = to_lanes(evaluator.derivative_errors(p, evaluator.evaluate(p))[1], n)
-        hessian_error = np.where(np.isfinite(bound), bound, 0.0)
 
     def compare(stencil: list[_StencilSample]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return three arrays (n,): the largest difference between an entry of the field's Hessian

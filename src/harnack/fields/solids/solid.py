@@ -186,8 +186,9 @@ class Solid(Field):
 
     __rand__ = __rsub__ = __ror__
 
-    def _refuse_arithmetic(self, *operands: Any) -> Any:
-        """Refuse arithmetic with a solid, which is a set of points.
+    def _refuse_arithmetic(self, other: Any = None) -> Any:
+        """Refuse arithmetic with a solid, which is a set of points. It is the method of several
+        operators.
 
         Raises:
             TypeError: always.
@@ -198,7 +199,8 @@ class Solid(Field):
             "functions, as a field, is harnack.fields.FieldSum([a, b], [1, 1])"
         )
 
-    __add__ = __radd__ = __neg__ = __mul__ = __rmul__ = __truediv__ = _refuse_arithmetic
+    __add__ = __radd__ = __mul__ = __rmul__ = _refuse_arithmetic
+    __truediv__ = __neg__ = _refuse_arithmetic
 
     def __invert__(self) -> Solid:
         from harnack.fields.solids.booleans import Complement
