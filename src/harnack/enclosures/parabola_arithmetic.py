@@ -21,6 +21,7 @@ import drjit as dr
 from harnack.arithmetic.interval import Interval
 from harnack.backend.elementary import fmax
 from harnack.enclosures.enclosure import STEP_SAFETY, Enclosure, PathPiece, SlopeRange
+from harnack.enclosures.extremum import NegatedEnclosure, ScaledEnclosure
 from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.sums import lipschitz_promise, taylor_constant, value_error
@@ -83,32 +84,12 @@ class RayFunction:
         weight: a number of either sign.
         sample: the sample of weight * f.
         """
-        factor = Interval.point(weight)
-
-        def scaled(lower: Real, upper: Real) -> Interval:
-            """The range from lower to upper, times the weight."""
-            return Interval(lower, upper) * factor
-
-        def scaled_range(slopes: SlopeRange) -> SlopeRange:
-            """A range of slopes, times the weight."""
-            return _range(scaled(slopes.lower, slopes.upper))
-
-        enclosures: list[Enclosure] = []
-        if self.pieces is not None:
-            cut: list[PathPiece] = []
-            for piece in self.pieces.pieces:
-                second = scaled(piece.min_second_derivative, piece.max_second_derivative)
-                slopes = scaled_range(piece.slope_range)
-                cut.append(PathPiece(piece.length, slopes, second.lower, second.upper))
-            slopes = scaled_range(self.pieces.slopes)
-            enclosures.append(PiecewiseTaylorEnclosure(slopes, tuple(cut)))
-        elif self.own_parabola is not None:
-            own = self.own_parabola
-            seconds = scaled(own.min_second_derivative, own.max_second_derivative)
-            enclosures.append(
-                _parabola(scaled(own.slopes.lower, own.slopes.upper), seconds, own.reach)
-            )
-        return RayFunction(sample, scaled_range(self.slopes), tuple(enclosures))
+        known = (self.pieces,) if self.pieces is not None else (self.own_parabola,)
+        return RayFunction(
+            sample,
+            _scaled_range(self.slopes, weight),
+            tuple(weighted_enclosure(e, weight, is_negative=False) for e in known if e is not None),
+        )
 
     def parabola(self, length: Real) -> ParabolaEnclosure | None:
         """The sharpest enclosure of the change of f between parabolas that is at hand, for lengths
@@ -127,6 +108,38 @@ class RayFunction:
         return ParabolaEnclosure(
             SlopeRange(-promise.constant, promise.constant), 0.0, 0.0, promise.radius
         )
+
+
+def weighted_enclosure(enclosure: Enclosure, weight: Real, *, is_negative: bool) -> Enclosure:
+    """The enclosure of the change of weight * f along a ray, from that of the change of f.
+
+    weight: a number other than 0.
+    is_negative: whether it is below 0. It does not matter for the kinds with which this file
+        computes, which stay what they are.
+    """
+    if isinstance(enclosure, PiecewiseTaylorEnclosure):
+        slopes = _scaled_range(enclosure.slopes, weight)
+        return PiecewiseTaylorEnclosure(
+            slopes, tuple(_scaled_piece(piece, weight) for piece in enclosure.pieces)
+        )
+    if type(enclosure) is ParabolaEnclosure:
+        factor = Interval.point(weight)
+        return _parabola(_slopes(enclosure) * factor, _seconds(enclosure) * factor, enclosure.reach)
+    scaled = ScaledEnclosure(enclosure, 1.0, -weight if is_negative else weight)
+    return NegatedEnclosure(scaled) if is_negative else scaled
+
+
+def _scaled_piece(piece: PathPiece, weight: Real) -> PathPiece:
+    """A piece of a ray, with the ranges of the derivatives of weight * f."""
+    seconds = Interval(piece.min_second_derivative, piece.max_second_derivative)
+    seconds = seconds * Interval.point(weight)
+    slopes = _scaled_range(piece.slope_range, weight)
+    return PathPiece(piece.length, slopes, seconds.lower, seconds.upper)
+
+
+def _scaled_range(slopes: SlopeRange, weight: Real) -> SlopeRange:
+    """A range of slopes, times a weight."""
+    return _range(Interval(slopes.lower, slopes.upper) * Interval.point(weight))
 
 
 def _parabola_of_pieces(pieces: PiecewiseTaylorEnclosure) -> ParabolaEnclosure:

@@ -24,8 +24,12 @@ from harnack.backend.tensors import accepts_tensors, is_tensor, tensor_to_array
 from harnack.backend.validation import as_finite, format_short
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures import Lipschitz
-from harnack.enclosures.extremum import NegatedEnclosure, ScaledEnclosure
-from harnack.enclosures.parabola_arithmetic import RayFunction, summed_enclosure, summed_slope
+from harnack.enclosures.parabola_arithmetic import (
+    RayFunction,
+    summed_enclosure,
+    summed_slope,
+    weighted_enclosure,
+)
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.enclosures.sums import shared_reach, summed_sample, weighted_sample
 from harnack.fields.capabilities import Boundary, VariableAccuracy
@@ -323,10 +327,9 @@ class _Term:
 
     def enclosure(self, enclosure: Enclosure) -> Enclosure:
         """The enclosure of the change of weight * f, from that of the change of f."""
-        if abs(self.number) != 1:
-            size = -self.weight if self.is_negative else self.weight
-            enclosure = ScaledEnclosure(enclosure, 1.0, size)
-        return NegatedEnclosure(enclosure) if self.is_negative else enclosure
+        if self.number == 1:
+            return enclosure
+        return weighted_enclosure(enclosure, self.weight, is_negative=self.is_negative)
 
     def differentiable_value(self, p: Vec3) -> Real:
         """weight * f at p, with derivatives with respect to p, the weight and parameters of f."""
