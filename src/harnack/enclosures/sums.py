@@ -237,54 +237,68 @@ def _harmonic_ball(terms: Sequence[Sample]) -> HarmonicBall | None:
     and one of space is a harmonic function of R^4 that does not depend on the fourth coordinate;
     their ranges on balls are the same. So in the largest of the dimensions all terms are harmonic
     on the smallest of the balls, and so is the sum. The bounds of the terms add up. A term with a
-    larger ball has a smaller range on this one (`_narrowed`).
+    larger ball has a smaller range on this one (`_narrowed`). If the sum would be bounded on
+    neither side, because one term has no lower bound and another one no upper bound, half the ball
+    is taken: there each term is bounded on both sides.
     """
     balls = [_first(term.all_promises, HarmonicBall) for term in terms]
     known = [ball for ball in balls if ball is not None]
     if len(known) < len(terms):
         return None
     radius = least([ball.radius for ball in known])
-    narrowed = [_narrowed(b, radius, term) for b, term in zip(known, terms, strict=True)]
-    lower = total([ball.lower for ball in narrowed])
-    upper = total([ball.upper for ball in narrowed])
+    is_half = all(
+        any(_is_unlimited(getattr(ball, end)) for ball in known) for end in ("lower", "upper")
+    )
+    if is_half:
+        radius = 0.5 * radius
+    pairs = zip(known, terms, strict=True)
+    ranges = [_narrowed(ball, radius, term, both_sides=is_half) for ball, term in pairs]
+    lower, upper = (total(ends) for ends in zip(*ranges, strict=True))
     if _is_unlimited(lower) and _is_unlimited(upper):
         return None
     return HarmonicBall(radius, lower, upper, max(ball.dimension for ball in known))
 
 
-def _narrowed(ball: HarmonicBall, radius: Real, sample: Sample) -> HarmonicBall:
-    """Return the harmonic ball of a sample with its range on the smaller ball of this radius.
+def _narrowed(
+    ball: HarmonicBall, radius: Real, sample: Sample, *, both_sides: bool
+) -> tuple[Real, Real]:
+    """Return a lower and an upper bound of the function of a sample on the ball of this radius,
+    from a harmonic ball that is not smaller.
+
+    both_sides: whether an infinite bound is replaced by a finite one. It is finite only if the
+        radius is smaller than that of the harmonic ball.
 
     Proof. With q = radius/ball.radius, the function u = f - lower >= 0 lies between u(p) (1-q) /
     (1+q)^(n-1) and u(p) (1+q)/(1-q)^(n-1) on the smaller ball, by Harnack's inequality; and
     likewise upper - f. The error of f(p), and the rounding of these formulas, widen the range.
     """
-    error, n = value_error(sample), ball.dimension
+    error = value_error(sample)
     q = fmin(radius / ball.radius * (1 + PROOF_ROUNDING), 1)
     least_factor, greatest_factor = (1 - q), (1 + q)
-    for _ in range(n - 1):
+    for _ in range(ball.dimension - 1):
         least_factor, greatest_factor = least_factor / (1 + q), greatest_factor / (1 - q)
 
-    def moved(end: Real, sign: float) -> tuple[Real, Real] | None:
+    def moved(end: Real, sign: float) -> tuple[Real, Real]:
         """Return how far f may move from f(p) to one end of its range, and away from that end, on
-        the smaller ball; None if the end is infinite. end: the upper end, with sign 1, or the lower
-        end, with sign -1."""
-        if _is_unlimited(end):
-            return None
+        the smaller ball. end: the upper end, with sign 1, or the lower end, with sign -1."""
         u = fmax(sign * (end - sample.value), 0) + error
-        towards, away = u * (1 - least_factor), u * (greatest_factor - 1)
         slack = PROOF_ROUNDING * u + error
-        return towards + slack, away * (1 + 4 * PROOF_ROUNDING) + slack
+        away = u * (greatest_factor - 1) * (1 + 4 * PROOF_ROUNDING)
+        return u * (1 - least_factor) + slack, away + slack
 
-    fall, rise = moved(ball.lower, -1.0), moved(ball.upper, 1.0)
     lower, upper = ball.lower, ball.upper
-    if fall is not None:
-        lower = fmax(sample.value - fall[0], lower)
-        upper = fmin(sample.value + fall[1], upper)
-    if rise is not None:
-        lower = fmax(sample.value - rise[1], lower)
-        upper = fmin(sample.value + rise[0], upper)
-    return dataclasses.replace(ball, radius=radius, lower=lower, upper=upper)
+    has_lower, has_upper = not _is_unlimited(lower), not _is_unlimited(upper)
+    if has_lower:
+        fall, rise = moved(ball.lower, -1.0)
+        lower = fmax(sample.value - fall, lower)
+        if has_upper or both_sides:
+            upper = fmin(sample.value + rise, upper)
+    if has_upper:
+        rise, fall = moved(ball.upper, 1.0)
+        upper = fmin(sample.value + rise, upper)
+        if has_lower or both_sides:
+            lower = fmax(sample.value - fall, lower)
+    return lower, upper
 
 
 def _bounded_laplacian(terms: Sequence[Sample]) -> BoundedLaplacian | None:
