@@ -57,8 +57,11 @@ FIELD_ROOMS = (
     "tape_evaluator",
     "formula",
     "clearance",
+    "weights",
+    "operands",
     "sums",
     "products",
+    "combining",
     "patch_boxes",
     "solid_angles",
     "analytic",
@@ -70,7 +73,7 @@ FIELD_ROOMS = (
 # Bases of `Field`, which answer with fields and so name them: in their types, or in their methods.
 BASES = {
     "capabilities": ("evaluator", "field"),
-    "operators": ("field", "sums", "products"),
+    "operators": ("field", "combining"),
 }
 # Families do not know each other. A new one is added above and in docs/architecture.md.
 FAMILIES = FIELD_ROOMS[FIELD_ROOMS.index("solid_angles") :]

@@ -24,31 +24,30 @@ class FieldOperators:
     __array_ufunc__ = None  # NumPy numbers leave the operation to the field
 
     def __add__(self, other: Any) -> Field:
-        from harnack.fields.sums import added
+        from harnack.fields.combining import added
 
         return added(self, other)
 
     __radd__ = __add__
 
     def __sub__(self, other: Any) -> Field:
-        from harnack.fields.sums import added
+        from harnack.fields.combining import added
 
         return added(self, other, sign=-1.0)
 
     def __rsub__(self, other: Any) -> Field:
-        from harnack.fields.sums import added, multiplied
+        from harnack.fields.combining import added, multiplied
 
         return added(multiplied(self, -1.0), other)
 
     def __neg__(self) -> Field:
-        from harnack.fields.sums import multiplied
+        from harnack.fields.combining import multiplied
 
         return multiplied(self, -1.0)
 
     def __mul__(self, other: Any) -> Field:
+        from harnack.fields.combining import has_own_operators, make_product, multiplied
         from harnack.fields.field import Field
-        from harnack.fields.products import make_product
-        from harnack.fields.sums import has_own_operators, multiplied
 
         if not isinstance(other, Field):
             return multiplied(self, other)
@@ -59,7 +58,7 @@ class FieldOperators:
     __rmul__ = __mul__
 
     def __truediv__(self, other: Any) -> Field:
-        from harnack.fields.sums import divided
+        from harnack.fields.combining import divided
 
         return divided(self, other)
 

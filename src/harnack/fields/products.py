@@ -1,6 +1,6 @@
 """Products of two fields, f g. A product is sampled by samples of its factors: derivatives follow
-by the product rule, and so do their proved bounds (`enclosures.products`). If both factors are
-formulas, so is the product. A product of harmonic functions is not harmonic.
+by the product rule, and so do their proved bounds (`enclosures.products`). A product of harmonic
+functions is not harmonic. (A product of formulas is a formula: `combining.FormulaProduct`.)
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ from harnack.enclosures.sums import shared_reach, value_error
 from harnack.fields.capabilities import Boundary, VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
-from harnack.fields.formula import Formula, own_formula
-from harnack.fields.sums import (
-    are_formulas,
+from harnack.fields.operands import (
     carries_derivatives,
     check_term,
     common_domain,
@@ -42,13 +40,6 @@ if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
     from harnack.enclosures import Enclosure
     from harnack.geometry import Volume
-
-
-def make_product(first: Field, second: Field) -> Field:
-    """The product of two fields."""
-    if are_formulas((first, second)):
-        return FormulaProduct((first, second))
-    return FieldProduct((first, second))
 
 
 class FieldProduct(Field):
@@ -113,27 +104,6 @@ class FieldProduct(Field):
         inner = Plan(ray_count=plan.ray_count)
         first, second = (factor.evaluator(backend, inner) for factor in self.factors)
         return ProductEvaluator(first, second)
-
-
-@dataclass(frozen=True, eq=False)
-class FormulaProduct(Formula):
-    """The product f g of two formulas, which is a formula.
-
-    factors: the two formulas.
-    """
-
-    factors: tuple[Field, Field]
-
-    def __post_init__(self) -> None:
-        """Set what follows from the factors: the domain and the traits."""
-        object.__setattr__(self, "domain", common_domain(self.factors))
-        object.__setattr__(self, "traits", common_traits(self.factors))
-
-    def formula(self, x: Any, y: Any, z: Any) -> Any:
-        first, second = self.factors
-        if first is second:  # the square has a sharper range
-            return own_formula(first)(x, y, z) ** 2
-        return own_formula(first)(x, y, z) * own_formula(second)(x, y, z)
 
 
 @dataclass(frozen=True, eq=False)
