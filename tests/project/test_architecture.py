@@ -59,6 +59,7 @@ FIELD_ROOMS = (
     "clearance",
     "weights",
     "operands",
+    "sum_jumps",
     "sums",
     "products",
     "combining",

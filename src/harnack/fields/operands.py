@@ -40,12 +40,6 @@ def check_term(term: Any) -> None:
     """Raise an error if a field cannot be a term of a sum or a factor of a product."""
     check_is_field(term)
     name = with_article(type(term).__name__)
-    if term.traits.has_jumps:
-        raise ValueError(
-            f"{name} jumps across facets, and sums and products of such fields are not known: of "
-            "winding numbers of closed meshes, add solids (harnack.solid(mesh)) by |, & and -; of "
-            "open ones, take harnack.SolidAngle of their boundaries, which does not jump"
-        )
     if term.traits.has_patches:
         raise ValueError(f"{name} is a union of many surfaces, which have no common function")
 
@@ -67,8 +61,11 @@ def common_traits(fields: tuple[Field, ...]) -> Traits:
         over_relaxation=min(entry.over_relaxation for entry in traits),
         min_wavelength=min(wavelengths, default=None),
         is_cheap=all(entry.is_cheap for entry in traits),
-        is_global=all(field.traits.is_global or field.domain is None for field in fields),
+        # Fields without a domain do not say so, because it is their extent that limits solids.
+        is_global=any(entry.is_global for entry in traits)
+        and all(field.traits.is_global or field.domain is None for field in fields),
         has_creases=any(entry.has_creases for entry in traits),
+        has_jumps=any(entry.has_jumps for entry in traits),
         has_variable_accuracy=any(entry.has_variable_accuracy for entry in traits),
     )
 

@@ -64,6 +64,11 @@ class FieldProduct(Field):
             raise ValueError(f"a product has two factors, not {len(self.factors)}")
         for factor in self.factors:
             check_term(factor)
+            if factor.traits.has_jumps:
+                raise ValueError(
+                    f"{with_article(type(factor).__name__)} jumps across facets, and products of "
+                    "such fields are not known; sums are: harnack.fields.FieldSum"
+                )
             if factor.period is not None:
                 raise ValueError(
                     f"{with_article(type(factor).__name__)} is angle-valued: known up to multiples "

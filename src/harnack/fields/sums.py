@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend.elementary import fmin
+from harnack.backend.elementary import fmax, fmin
 from harnack.backend.tensors import accepts_tensors
 from harnack.backend.validation import as_finite
 from harnack.cluster.dask_arrays import accepts_dask_arrays
@@ -30,7 +30,7 @@ from harnack.enclosures.parabola_arithmetic import (
 )
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.enclosures.sums import shared_reach, summed_sample, weighted_sample
-from harnack.fields.capabilities import Boundary, VariableAccuracy
+from harnack.fields.capabilities import Boundary, Jumps, VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
 from harnack.fields.operands import (
@@ -45,6 +45,7 @@ from harnack.fields.operands import (
     sample_rays,
     weighted_boundary,
 )
+from harnack.fields.sum_jumps import WeightedJumps
 from harnack.fields.weights import (
     checked_number,
     checked_weights,
@@ -83,8 +84,8 @@ class FieldSum(Field):
     Raises:
         TypeError: a term that is no field, or a weight that is no number.
         ValueError: no terms; not a weight for each; a number that is not finite; angle-valued terms
-            whose weights have no such quotients, or are Dr.Jit numbers; a term that jumps across
-            facets or is a union of patches.
+            whose weights have no such quotients, or are Dr.Jit numbers; several terms that jump
+            across facets; a term that is a union of patches.
     """
 
     traits = Traits(has_parameter_derivatives=True)
@@ -99,6 +100,13 @@ class FieldSum(Field):
             raise ValueError("give at least one term")
         for term in entries:
             check_term(term)
+        if sum(term.traits.has_jumps for term in entries) > 1:
+            raise ValueError(
+                "only one term of a sum may jump across facets, as winding numbers of meshes do: "
+                "for equal weights, take harnack.WindingNumber of all meshes as one; of open "
+                "meshes, harnack.SolidAngle of their boundaries does not jump; of points, "
+                "harnack.DipolePotential does not"
+            )
         self.terms: tuple[Field, ...] = entries
         self.weights = checked_weights(weights, len(entries))
         self.constant = checked_number(constant, "constant")
@@ -114,11 +122,12 @@ class FieldSum(Field):
         if self.period is not None and abs(math.remainder(level, self.period)) < 1e-6 * self.period:
             level += 0.5 * self.period  # the value far away has no bounded level set
         self.default_level = level
+        pairs = [*zip(entries, self._weight_numbers, strict=True)]
         self.traits = dataclasses.replace(
             common_traits(entries),
+            has_jumps=any(term.traits.has_jumps and weight != 0 for term, weight in pairs),
             is_larger_inside=all(
-                term.traits.is_larger_inside == (weight > 0)
-                for term, weight in zip(entries, self._weight_numbers, strict=True)
+                term.traits.is_larger_inside == (weight > 0) for term, weight in pairs
             ),
             has_parameter_derivatives=True,
         )
@@ -308,6 +317,27 @@ class SumEvaluator(Evaluator):
         return tuple(term for term in self.terms if term.number != 0)
 
     @property
+    def jumps(self) -> Jumps | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The facets of the term that jumps; None if there is none."""
+        for k, term in enumerate(self.terms):
+            if term.evaluator.jumps is None or term.number == 0:
+                continue
+
+            def continued(evaluator: Evaluator, k: int = k) -> Evaluator:
+                """The sum, with this evaluator of the term that jumps."""
+                term = dataclasses.replace(self.terms[k], evaluator=evaluator)
+                terms = (*self.terms[:k], term, *self.terms[k + 1 :])
+                return dataclasses.replace(self, terms=terms)
+
+            return WeightedJumps(
+                term.evaluator.jumps,
+                term.weight,
+                is_negative=term.is_negative,
+                with_continuation=continued,
+            )
+        return None
+
+    @property
     def variable_accuracy(  # pyright: ignore[reportIncompatibleVariableOverride]
         self,
     ) -> VariableAccuracy | None:
@@ -316,12 +346,17 @@ class SumEvaluator(Evaluator):
         accuracies = [term.evaluator.variable_accuracy for term in self.terms]
         known = [accuracy for accuracy in accuracies if accuracy is not None]
 
+        def sampled_at(term: _Term, accuracy: VariableAccuracy, scale: Real) -> _Term:
+            """A term that is sampled at this accuracy scale, and never up to an unknown integer,
+            which the weight would multiply."""
+            if accuracy.may_lack_integer:
+                scale = fmax(scale, accuracy.coarsest)
+            return dataclasses.replace(term, evaluator=accuracy.at(scale))
+
         def at(scale: Real) -> Evaluator:
             """The sum, with its terms sampled at this accuracy scale."""
-            terms = tuple(
-                term if a is None else dataclasses.replace(term, evaluator=a.at(scale))
-                for term, a in zip(self.terms, accuracies, strict=True)
-            )
+            pairs = zip(self.terms, accuracies, strict=True)
+            terms = tuple(term if a is None else sampled_at(term, a, scale) for term, a in pairs)
             return dataclasses.replace(self, terms=terms)
 
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None

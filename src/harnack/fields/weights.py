@@ -12,7 +12,7 @@ import numpy as np
 
 from harnack.backend import backend_of, to_numpy
 from harnack.backend.tensors import is_tensor, tensor_to_array
-from harnack.backend.validation import as_finite, format_short
+from harnack.backend.validation import as_finite, check_no_derivatives, format_short
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real
@@ -40,6 +40,7 @@ def checked_number(value: Any, name: str) -> Any:
     """A number as a float, or as a Dr.Jit array of one lane. name: what it is, for messages."""
     kind = cast("Any", type(value))
     if not dr.is_array_v(kind):
+        check_no_derivatives(name, value)  # a number of PyTorch
         return as_finite(value, name)
     array = tensor_to_array(value, name) if is_tensor(value) else value
     if dr.depth_v(type(array)) != 1 or dr.width(array) != 1:
