@@ -147,11 +147,11 @@ def test_no_first_hit_is_missed(name: str, precision: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["three", "creases and harmonic", "solid angle and harmonic", "clouds", "product"]
+    "name", ["creases and harmonic", "solid angle and harmonic", "clouds", "product"]
 )
 def test_promises_hold(name: str) -> None:
     field, _ = CASES[name]
-    points = np.random.default_rng(3).uniform(-0.55, 0.55, (60, 3))
+    points = np.random.default_rng(3).uniform(-0.55, 0.55, (20, 3))
     check_field(field, points)
 
 
