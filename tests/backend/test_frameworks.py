@@ -47,10 +47,21 @@ def slopes(points: Any) -> Any:
     return hk.SolidAngle(LOOP).gradient(points)
 
 
+def depths_of_sum(first: Any, second: Any, constant: Any, origins: Any, directions: Any) -> Any:
+    terms = hk.SphericalHarmonic(2, 0), hk.SphericalHarmonic(3, 1)
+    field = hk.fields.FieldSum(terms, [first, second], constant)
+    hits = hk.trace(field, origins, directions, level=0.1)
+    return dr.select(hits.is_hit, hits.t, 0)
+
+
 CASES: dict[str, tuple[Any, list[Any]]] = {
     "trace": (depths, [LOOP, np.tile(EYE, (20, 1)), AWAY, np.array(6.0)]),
     "value": (angles, [LOOP, POINTS]),
     "gradient": (slopes, [POINTS]),
+    "weights": (
+        depths_of_sum,
+        [*map(np.array, (2.0, 1.0, 0.05)), np.tile(EYE, (20, 1)), AWAY],
+    ),
 }
 
 

@@ -281,6 +281,7 @@ def test_every_field_there_is_is_tested() -> None:
     # Those have contracts in the test files of their own.
     tested |= {hk.Blobs, hk.fields.HRBF, hk.fields.Molecule, hk.PolygonMesh, hk.solids.TubeNetwork}
     tested |= {hk.fields.RiemannSurface, hk.fields.HeightField, hk.fields.LevelCurves}
+    tested |= {hk.fields.FieldSum, hk.fields.FieldProduct}
     missing = {
         kind.__name__ for kind in exported if not any(issubclass(each, kind) for each in tested)
     }

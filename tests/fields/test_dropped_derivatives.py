@@ -74,8 +74,8 @@ def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
     """Constructors of fields and volumes, class methods that make them, and methods of solids and
     of fields whose data may move."""
     for kind in (*public_classes(hk.Field), *public_classes(Volume)):
-        if kind is hk.SolidAngle:
-            continue  # it has derivatives by its vertices
+        if kind in (hk.SolidAngle, hk.fields.FieldSum, hk.fields.FieldProduct):
+            continue  # they have derivatives by vertices and weights
         yield kind.__name__, kind
         for name, own in vars(kind).items():
             if isinstance(own, classmethod) and not name.startswith("_"):

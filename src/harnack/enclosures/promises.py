@@ -125,15 +125,18 @@ class Promise(abc.ABC):
 
     def scaled(self, factor: Real) -> Self:
         """Return the promise of factor * f, for factor > 0."""
-        # A number whose unit contains that of f is multiplied; the power is 1.
-        return self.map_numbers(lambda number, of_f, _: number * factor if of_f else number)
+        # A number whose unit contains that of f is multiplied; the power is 1. An infinite one
+        # stays a Python number, for code that asks for it while a kernel is recorded.
+        return self.map_numbers(
+            lambda number, of_f, _: number * factor if of_f and not _is_infinite(number) else number
+        )
 
     def shifted(self, offset: Real) -> Self:
         """Return the promise of f + offset. The range of f itself, the first pair of
         `interval_pairs`, is shifted."""
-        numbers = {
-            name: getattr(self, name) + offset for pair in self.interval_pairs[:1] for name in pair
-        }
+        names = [name for pair in self.interval_pairs[:1] for name in pair]
+        ends = {name: getattr(self, name) for name in names}
+        numbers = {name: end if _is_infinite(end) else end + offset for name, end in ends.items()}
         return dataclasses.replace(self, **numbers)
 
     def negated(self) -> Self:

@@ -26,6 +26,7 @@ from .expressions import expression
 from .field import EvaluateOnly, Evaluator, Field, Plan, Sample, SampleEvaluator, Traits
 from .formula import Formula
 from .networks.network import Network
+from .products import FieldProduct
 from .solid_angles.dipole import DipolePotential
 from .solid_angles.morph import Morph
 from .solid_angles.polygon_mesh import PolygonMesh
@@ -33,6 +34,7 @@ from .solid_angles.screened import ScreenedWindingNumber
 from .solid_angles.solid_angle import SolidAngle
 from .solid_angles.winding_number import WindingNumber
 from .solids.solid import FormulaSolid, Solid
+from .sums import FieldSum
 
 __all__ = [
     "HRBF",
@@ -46,6 +48,8 @@ __all__ = [
     "EvaluateOnly",
     "Evaluator",
     "Field",
+    "FieldProduct",
+    "FieldSum",
     "Formula",
     "FormulaSolid",
     "FourierSeries",

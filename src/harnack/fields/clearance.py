@@ -6,6 +6,8 @@ gives clearances at points. `tight_extent` proves in which volume the level sets
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -30,7 +32,13 @@ if TYPE_CHECKING:
     from harnack.geometry import ConvexHull, Volume
     from harnack.tree.empty_space import Clearance
 
-__all__ = ["clearance_function", "level_distance_lower_bound", "occupied_cells", "tight_extent"]
+__all__ = [
+    "bounded_side_extent",
+    "clearance_function",
+    "level_distance_lower_bound",
+    "occupied_cells",
+    "tight_extent",
+]
 
 # The enclosures (bounds of f along a line) by which clearances are proved. They use all promises of
 # a field: there are few points, so time matters less than a large clearance.
@@ -127,6 +135,38 @@ def _clearance_outside(polytope: ConvexHull, clearance: Clearance) -> Clearance:
         return depth
 
     return clearance_outside
+
+
+def bounded_side_extent(
+    field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
+) -> Volume | None:
+    """A volume that contains all points inside a solid made of the field f; None if none is known.
+    If f is defined only in the field's domain, or the field has no extent (a volume that contains
+    the level sets), it is the domain. Otherwise it is the extent, if that is bounded and all points
+    outside of it are outside of the solid.
+
+    field: the field f.
+    levels: the values of f on the surface of the solid.
+    is_inside: a function that takes a value of f, and returns whether points with this value are
+        inside the solid.
+
+    Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
+    is connected and meets no level. So a single point of the complement decides on which side of
+    the levels the whole complement lies. If it is outside the solid, the extent contains the solid.
+    """
+    extent = field.extent(levels)
+    if field.traits.is_global and extent is field.domain:
+        # For a global field the domain only clips the picture, and bounds no level set.
+        return None
+    if extent is None or (field.domain is not None and not field.traits.is_global):
+        return field.domain
+    lower, upper = extent.bounds()
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        return None
+    # Any point outside of the extent's box decides, as in the proof.
+    outside = upper + (upper - lower) + 1e-3
+    value = float(field.value(outside, precision="double"))
+    return None if is_inside(value) or not math.isfinite(value) else extent
 
 
 def occupied_cells(

@@ -44,6 +44,7 @@ from harnack.enclosures.samples import (
 )
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
+from harnack.fields.operators import FieldOperators
 from harnack.fields.parameters import Parametrized, differentiable_parameters, record_call
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import with_article
@@ -131,7 +132,7 @@ class Traits:
     has_parameter_derivatives: bool = False
 
 
-class Field(Parametrized, abc.ABC):
+class Field(FieldOperators, Parametrized, abc.ABC):
     """A scalar function f on R^3 whose level sets can be traced with a proof. A level is a number,
     and its level set is the surface f = level. A sample at a point holds value and gradient of f
     there, and promises: proved bounds of f near the point. Points p are Dr.Jit 3-vectors, one point
@@ -259,24 +260,6 @@ class Field(Parametrized, abc.ABC):
         if name in _SOLID_METHODS:
             message += ": make a solid of the field first, by harnack.solid(field, below=level)"
         raise AttributeError(message)
-
-    def _is_no_number(self, *operands: Any) -> Any:
-        """Refuse arithmetic and comparisons with a field: it is the method of all these operators.
-        `Solid` replaces the operator -. Every field keeps ==.
-
-        Raises:
-            TypeError: always.
-        """
-        raise TypeError(
-            f"{with_article(type(self).__name__)} is a function of space, which is not computed "
-            "with as numbers are: the level c of 2 f is the level c/2 of f, sums and products are "
-            "written as one formula, harnack.expression(lambda x, y, z: ...), and solids, which "
-            "harnack.solid makes of fields, are combined by |, & and -"
-        )
-
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _is_no_number
-    __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __neg__ = __abs__ = _is_no_number
-    __lt__ = __le__ = __gt__ = __ge__ = _is_no_number
 
     def evaluate(self, p: Vec3) -> Sample:
         """The sample at p: value and gradient of f, and promises (proved bounds of f near p). p is

@@ -39,7 +39,7 @@ from harnack.geometry.volume import (
     normalize_empty_interval,
 )
 
-__all__ = ["Ball", "Box", "HalfSpace", "VolumeIntersection"]
+__all__ = ["Ball", "Box", "HalfSpace", "VolumeIntersection", "box_around_volumes"]
 
 MAX_UNROLLED = 32
 """Up to this number of planes, the loop over planes is unrolled in the kernel."""
@@ -549,3 +549,17 @@ class VolumeIntersection(Volume):
 
     def padded(self, distance: float) -> VolumeIntersection:
         return VolumeIntersection(v.padded(distance) for v in self.volumes)
+
+
+def box_around_volumes(volumes: list[Volume]) -> Volume | None:
+    """A volume that contains the given volumes: a box around them or, if there is only one, that
+    volume itself. None if one of them is unbounded."""
+    # `bounds` is a pair of corners, the lowest and the highest.
+    corners = [entry.bounds() for entry in volumes]
+    lower = np.min([entry for entry, _ in corners], axis=0)
+    upper = np.max([entry for _, entry in corners], axis=0)
+    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
+        return None
+    if len(volumes) == 1:
+        return volumes[0]
+    return Box(tuple(lower), tuple(upper))

@@ -30,10 +30,11 @@ import numpy as np
 from harnack.backend import FloatArray
 from harnack.backend.validation import as_finite
 from harnack.fields import Field, Solid
+from harnack.fields.clearance import bounded_side_extent
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fields.solids.booleans import BooleanSolid, Complement, OffsetSolid
 from harnack.fields.solids.extrusions import Extrusion, SolidOfRevolution
-from harnack.fields.solids.from_field import BandSolid, SublevelSolid, bounded_side_extent
+from harnack.fields.solids.from_field import BandSolid, SublevelSolid
 from harnack.fields.solids.from_field import solid as solid_of
 from harnack.fields.solids.mesh_solid import MeshSolid
 from harnack.fields.solids.primitives import Cuboid, Cylinder, Plane, Sphere

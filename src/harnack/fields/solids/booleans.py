@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
 
 from harnack.arithmetic import maximum, minimum
 from harnack.arithmetic.norms import blend_intersection, blend_union
@@ -43,7 +42,8 @@ from harnack.fields.solids.solid import (
     without_levels,
 )
 from harnack.fields.tape_evaluator import tape_evaluator
-from harnack.geometry import Box, VolumeIntersection
+from harnack.geometry import VolumeIntersection
+from harnack.geometry.clip_volumes import box_around_volumes
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -254,7 +254,7 @@ class BooleanSolid(Solid):
         # points anywhere.
         if len(bounded) < len(extents):
             return None
-        return _box_around_volumes(bounded)
+        return box_around_volumes(bounded)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return _extremum(
@@ -522,20 +522,6 @@ def lipschitz_of(sample: Sample) -> Lipschitz | None:
     implied = [promise.implied_lipschitz(sample.value) for promise in sample.all_promises]
     stated = (promise for promise in sample.all_promises if isinstance(promise, Lipschitz))
     return next(stated, None) or next((promise for promise in implied if promise is not None), None)
-
-
-def _box_around_volumes(volumes: list[Volume]) -> Volume | None:
-    """A volume that contains the given volumes: a box around them or, if there is only one, that
-    volume itself. None if one of them is unbounded."""
-    # `bounds` is a pair of corners, the lowest and the highest.
-    corners = [entry.bounds() for entry in volumes]
-    lower = np.min([entry for entry, _ in corners], axis=0)
-    upper = np.max([entry for _, entry in corners], axis=0)
-    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
-        return None
-    if len(volumes) == 1:
-        return volumes[0]
-    return Box(tuple(lower), tuple(upper))
 
 
 @dataclass(frozen=True, eq=False)

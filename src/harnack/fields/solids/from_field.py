@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
 
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
@@ -23,6 +22,7 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.clearance import bounded_side_extent
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, has_own_formula, on_backend, own_formula
@@ -200,38 +200,6 @@ class _SublevelSolidEvaluator(EvaluatorOfInner):
         if not is_jet(x, self.field_name):
             return self.differentiable_value(_vector(x, y, z))
         return field_jet(self.inner, x, y, z, self.field_name)
-
-
-def bounded_side_extent(
-    field: Field, levels: tuple[float, ...], is_inside: Callable[[float], bool]
-) -> Volume | None:
-    """A volume that contains all points inside a solid made of the field f; None if none is known.
-    If f is defined only in the field's domain, or the field has no extent (a volume that contains
-    the level sets), it is the domain. Otherwise it is the extent, if that is bounded and all points
-    outside of it are outside of the solid.
-
-    field: the field f.
-    levels: the values of f on the surface of the solid.
-    is_inside: a function that takes a value of f, and returns whether points with this value are
-        inside the solid.
-
-    Proof. The level sets lie in `Field.extent`, which is convex. If it has bounds, its complement
-    is connected and meets no level. So a single point of the complement decides on which side of
-    the levels the whole complement lies. If it is outside the solid, the extent contains the solid.
-    """
-    extent = field.extent(levels)
-    if field.traits.is_global and extent is field.domain:
-        # For a global field the domain only clips the picture, and bounds no level set.
-        return None
-    if extent is None or (field.domain is not None and not field.traits.is_global):
-        return field.domain
-    lower, upper = extent.bounds()
-    if not (np.isfinite(lower).all() and np.isfinite(upper).all()):
-        return None
-    # Any point outside of the extent's box decides, as in the proof.
-    outside = upper + (upper - lower) + 1e-3
-    value = float(field.value(outside, precision="double"))
-    return None if is_inside(value) or not math.isfinite(value) else extent
 
 
 def _vector(x: Real, y: Real, z: Real) -> Vec3:

@@ -20,6 +20,7 @@ from harnack.fields.field import Field, Traits
 from harnack.fields.formula import Formula
 from harnack.fields.formula_evaluator import FormulaFunction
 from harnack.geometry import Ball, Box, Volume
+from harnack.name_suggestions import with_article
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -184,6 +185,22 @@ class Solid(Field):
         raise TypeError(not_a_solid(other))
 
     __rand__ = __rsub__ = __ror__
+
+    def _refuse_arithmetic(self, other: Any = None) -> Any:
+        """Refuse arithmetic with a solid, which is a set of points. It is the method of several
+        operators.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(
+            f"{with_article(type(self).__name__)} is a set of points: solids are combined by |, & "
+            "and -, scaled by scaled(factor), and grown by offset(distance); the sum of their "
+            "functions, as a field, is harnack.fields.FieldSum([a, b], [1, 1])"
+        )
+
+    __add__ = __radd__ = __mul__ = __rmul__ = _refuse_arithmetic
+    __truediv__ = __neg__ = _refuse_arithmetic
 
     def __invert__(self) -> Solid:
         from harnack.fields.solids.booleans import Complement
