@@ -329,11 +329,21 @@ def as_real(value: Any, name: str) -> float:
     """
     if type(value) is float:  # the most frequent type
         return value
+    if dr.is_array_v(cast("Any", type(value))):
+        return _real_of_array(value, name)
     try:
         # float("none") raises ValueError, so texts and bools are refused.
         return float("none" if isinstance(value, str | bytes | bool | np.bool_) else value)
     except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name} must be a number, not {value!r}") from None
+
+
+def _real_of_array(value: Any, name: str) -> float:
+    """The number in a Dr.Jit array or tensor of one number, without its derivatives."""
+    numbers = np.array(dr.detach(value), np.float64).ravel()
+    if numbers.size != 1:
+        raise TypeError(f"{name} must be a number, not {numbers.size} numbers")
+    return float(numbers[0])
 
 
 def as_positive(value: Any, name: str) -> float:
@@ -413,8 +423,9 @@ def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[flo
     Raises:
         TypeError, ValueError: they are not three such numbers.
     """
+    is_array = dr.is_array_v(cast("Any", type(value)))
     try:
-        entries = tuple(value)
+        entries = tuple(np.array(dr.detach(value)).ravel() if is_array else value)
     except TypeError:
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     if len(entries) != 3:

@@ -6,6 +6,7 @@ or a call of a function), and then evaluated; it is never run as Python."""
 from __future__ import annotations
 
 import ast
+import dataclasses
 import inspect
 import math
 import re
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from harnack import arithmetic
-from harnack.backend.validation import as_finite, check_no_derivatives, flag, no_derivatives
+from harnack.backend.validation import as_finite, check_no_derivatives, flag
 from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
 from harnack.fields.formula_evaluator import as_jet
 from harnack.fields.tape_evaluator import extent_of_long_formula, recorded_tape
@@ -62,36 +63,29 @@ _TOO_DEEP = (
 @dataclass(frozen=True)
 class TextFormula:
     """A formula f(x, y, z) that is given as a text. An object of this class is called like any
-    function of three coordinates.
+    function of three coordinates and of the formula's parameters, by name.
 
     text: it is made of + - * / ^ (or **), brackets, numbers, x, y, z, pi, e, parameters and the
         functions `_FUNCTIONS`. An equation "left = right" means left - right.
     tree: the text's syntax tree, which is evaluated node by node. It is never run as Python, so
         that texts from untrusted sources do no harm.
-    parameters: numbers by their names in the text.
     """
 
     text: str
     tree: ast.expr
-    parameters: Mapping[str, float] = field(default_factory=dict[str, float])
-
-    def __post_init__(self) -> None:
-        """Convert the parameters to floats. Raises ValueError if one is not finite."""
-        numbers = {name: as_finite(number, name) for name, number in self.parameters.items()}
-        object.__setattr__(self, "parameters", numbers)
 
     @classmethod
-    def parse(cls, text: str, parameters: Mapping[str, float] | None = None) -> TextFormula:
+    def parse(cls, text: str, parameters: Iterable[str] = ()) -> TextFormula:
         """Parse a text to a formula.
 
-        parameters: numbers by their names in the text; None for no parameters.
+        parameters: the names of its parameters.
 
         Raises:
             ValueError: the text is not a formula (the message states the position and the mistake);
                 or a parameter is not in it; or the name of a parameter is already that of a
                 function, a constant or a coordinate.
         """
-        parameters = parameters or {}
+        parameters = tuple(parameters)
         if len(text) > _MAX_LENGTH:
             raise ValueError(f"a formula has at most {_MAX_LENGTH:,} characters, not {len(text):,}")
         # A character that no formula has, or a number that is not decimal, such as 0x1F.
@@ -110,7 +104,7 @@ class TextFormula:
                 raise ValueError(f"{name!r} has a meaning in formulas: call a parameter otherwise")
             if name not in names:
                 raise ValueError(f"there is no parameter {name!r} in the formula {text!r}")
-        return cls(text, tree, parameters)
+        return cls(text, tree)
 
     @staticmethod
     def _parse_side(text: str, side: str) -> ast.expr:
@@ -139,24 +133,23 @@ class TextFormula:
         hint = f"is a * missing at {missing[0]!r}" if missing else "an operator or bracket is amiss"
         raise _formula_error(text, hint)
 
-    def __call__(self, x: Any, y: Any, z: Any) -> Any:
+    def __call__(self, x: Any, y: Any, z: Any, **numbers: Any) -> Any:
         """The value of the formula at coordinates of any kind: numbers, NumPy or Dr.Jit arrays, or
-        numbers with proved ranges.
+        numbers with proved ranges. numbers: those of the parameters.
 
         Raises:
             ValueError: a constant part divides by zero, is too large, or is not real.
         """
         try:
             with np.errstate(all="ignore"):  # in constants; a result that is not finite is refused
-                return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **self.parameters})
+                return _value(self.tree, {"x": x, "y": y, "z": z, **_CONSTANTS, **numbers})
         except ZeroDivisionError:
             raise _formula_error(self.text, "it divides by zero") from None
         except OverflowError:
             raise _formula_error(self.text, "a number in it is too large, or not real") from None
 
     def __repr__(self) -> str:
-        numbers = "".join(f", {name} = {number:g}" for name, number in self.parameters.items())
-        return self.text + numbers
+        return self.text
 
 
 def looks_like_formula(text: str) -> bool:
@@ -334,6 +327,7 @@ class Expression(Formula):
     function: takes three coordinates. It is called while a kernel is being recorded, and numbers in
         it become literals of that kernel. A text is parsed to a `TextFormula`.
     domain: the volume in which f is drawn; None for all of space.
+    numbers: further arguments of the function, or parameters of a text, by name.
     default_level: the level that is drawn by default.
     is_convex: whether f is a convex function.
 
@@ -342,9 +336,11 @@ class Expression(Formula):
     """
 
     literals = ("default_level",)
+    traits = dataclasses.replace(Formula.traits, differentiable_arguments=("numbers",))
 
-    function: Callable[[Any, Any, Any], Any]
+    function: Callable[..., Any]
     domain: Volume | None = None
+    numbers: Mapping[str, float] = field(default_factory=dict[str, float])
     default_level: float = field(default=0.0, kw_only=True)
     is_convex: bool = field(default=False, kw_only=True)
 
@@ -352,14 +348,16 @@ class Expression(Formula):
         """Check all arguments; `function` becomes a function if it is a text."""
         function = cast("Any", self.function)
         if isinstance(function, str):
-            function = TextFormula.parse(function)
+            function = TextFormula.parse(function, self.numbers)
         if not callable(function):
             raise TypeError(
                 "function must be callable, such as lambda x, y, z: x * y - z, or a text, such as "
                 f'"x * y = z", not {function!r}'
             )
-        _check_arguments(function)
+        _check_arguments(function, self.numbers)
         object.__setattr__(self, "function", function)  # the dataclass is frozen
+        numbers = {name: as_finite(number, name) for name, number in self.numbers.items()}
+        object.__setattr__(self, "numbers", MappingProxyType(numbers))
         object.__setattr__(self, "default_level", as_finite(self.default_level, "level"))
         object.__setattr__(self, "is_convex", flag(self.is_convex, "is_convex"))
         if recorded_tape(self) is not None:
@@ -371,7 +369,7 @@ class Expression(Formula):
         check_no_derivatives("an expression", value)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.function(x, y, z)
+        return self.function(x, y, z, **self.numbers)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         if self.domain is not None:
@@ -384,12 +382,13 @@ class ExpressionFunction(Protocol):
 
     def __call__(
         self,
-        function: Callable[[Any, Any, Any], Any] | str,
+        function: Callable[..., Any] | str,
         *,
         parameters: Mapping[str, float] | None = None,
         domain: Volume | None = None,
         level: float = 0.0,
         is_convex: bool = False,
+        **numbers: float,
     ) -> Expression: ...
 
     def from_vm(
@@ -429,14 +428,14 @@ def _with_files(function: Callable[..., Expression]) -> ExpressionFunction:
 
 
 @_with_files
-@no_derivatives
 def expression(
-    function: Callable[[Any, Any, Any], Any] | str,
+    function: Callable[..., Any] | str,
     *,
     parameters: Mapping[str, float] | None = None,
     domain: Volume | None = None,
     level: float = 0.0,
     is_convex: bool = False,
+    **numbers: float,
 ) -> Expression:
     """The implicit surface f(x, y, z) = level of a user's own formula, as a field. The formula is a
     Python function or a text; a text may have parameters, numbers by name.
@@ -446,12 +445,14 @@ def expression(
         `atan2`, `asin`, `acos`, `sinh`, `cosh`, `maximum`, `minimum`, `norm`. NumPy's functions of
         the same names work too. Or a text, such as "x^2 + y^2 = 1 + sin(2*z)", in which maximum and
         minimum are `max` and `min`; an equation means left - right.
-    parameters: for a text, numbers by their names, such as {"a": 2.0} for "x^2 + y^2 = a"; None for
-        no parameters. A Python function takes none: its numbers are those of the function around
-        it, such as `def cylinder(a): return hk.expression(lambda x, y, z: x**2 + y**2 - a)`.
+    parameters: numbers by their names, such as {"a": 2.0} for the text "x^2 + y^2 = a"; None for no
+        parameters. A Python function takes them as further arguments: lambda x, y, z, a: ... They
+        may be Dr.Jit numbers with derivatives, by which values, gradients and hits are then
+        differentiated.
     domain: the volume in which the surface is drawn, such as `harnack.Ball()`; None for all of
         space.
     level: the level that is drawn by default.
+    numbers: the same as parameters, as arguments: hk.expression("x^2 + y^2 = a", a=2.0).
     is_convex: your promise that the function is convex, as quadrics and norms are. Then steps
         towards the surface are longer. `harnack.testing.check_field` tests the promise at samples.
 
@@ -462,36 +463,32 @@ def expression(
     Raises:
         TypeError: function cannot be called with three coordinates, or uses operations without
             proved ranges; domain is not a volume.
-        NotImplementedError: function uses numbers with derivatives enabled.
+        NotImplementedError: function uses other numbers with derivatives enabled.
         ValueError: level is not finite; a text is not a formula, or lacks a parameter.
     """
     if parameters is not None and not isinstance(cast("Any", parameters), Mapping):
         raise TypeError(f'parameters are numbers by name, such as {{"a": 2}}, not {parameters!r}')
+    values = {**(parameters or {}), **numbers}
     if isinstance(function, str):
-        function = TextFormula.parse(function, parameters)
-    elif parameters:
-        name = next(iter(parameters))
-        raise TypeError(
-            "parameters are of formulas as text: a Python function has its own numbers. Write the "
-            f"formula as a text, or a function of {name} that returns hk.expression(lambda x, y, "
-            "z: ...)"
-        )
-    field = Expression(function, domain, default_level=level, is_convex=is_convex)
+        function = TextFormula.parse(function, values)
+    check_no_derivatives("expression", function, domain, level)
+    field = Expression(function, domain, values, default_level=level, is_convex=is_convex)
     warn_if_slow_to_compile(field)
     return field
 
 
-def _check_arguments(function: Callable[..., Any]) -> None:
-    """Raise TypeError if a function cannot be called with three coordinates. A function whose
-    signature is not known is accepted."""
+def _check_arguments(function: Callable[..., Any], numbers: Mapping[str, float]) -> None:
+    """Raise TypeError if a function cannot be called with three coordinates and numbers by name. A
+    function whose signature is not known is accepted."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of what is not written in Python nothing may be known
         return
     try:
-        signature.bind(0.0, 0.0, 0.0)
+        signature.bind(0.0, 0.0, 0.0, **numbers)
     except TypeError:
+        names = "".join(f", {name}" for name in numbers)
         raise TypeError(
-            "function must take three coordinates, such as lambda x, y, z: x * y - z; this one "
-            f"takes {signature}"
+            "function must take three coordinates, such as lambda x, y, z: x * y - z, and the "
+            f"numbers by name, here (x, y, z{names}); this one takes {signature}"
         ) from None

@@ -15,7 +15,7 @@ import copyreg
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, cast, get_origin
 
@@ -28,6 +28,7 @@ from harnack.backend.tensors import accepts_tensors
 from harnack.backend.validation import (
     check_no_derivatives,
     format_short,
+    has_derivatives,
     is_same_or_equal,
     make_read_only,
     no_derivatives,
@@ -42,10 +43,16 @@ from harnack.enclosures.samples import (
     space_scaled,
     validate_samples,
 )
+from harnack.fields.attached_numbers import gradient_with_parameters, value_with_parameters
 from harnack.fields.batch_evaluation import accepts_numpy_points, evaluate_points
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.operators import FieldOperators
-from harnack.fields.parameters import Parametrized, differentiable_parameters, record_call
+from harnack.fields.parameters import (
+    ATTACHED,
+    Parametrized,
+    differentiable_parameters,
+    record_call,
+)
 from harnack.geometry.volume import check_volume
 from harnack.name_suggestions import with_article
 
@@ -118,6 +125,10 @@ class Traits:
     has_parameter_derivatives: whether f can be differentiated with respect to those of its
         parameters that are Dr.Jit arrays. If not, the constructor refuses arguments with
         derivatives enabled.
+    differentiable_arguments: the names of arguments of the constructor by whose numbers f can be
+        differentiated, because its formula uses them as they are (`fields.attached_numbers`):
+        Dr.Jit numbers, or fields made of such. The constructor refuses other arguments with
+        derivatives enabled.
     """
 
     over_relaxation: float = 1.4
@@ -130,6 +141,7 @@ class Traits:
     has_variable_accuracy: bool = False
     is_larger_inside: bool = False
     has_parameter_derivatives: bool = False
+    differentiable_arguments: tuple[str, ...] = ()
 
 
 class Field(FieldOperators, Parametrized, abc.ABC):
@@ -170,6 +182,7 @@ class Field(FieldOperators, Parametrized, abc.ABC):
                 `Traits`; or an argument `domain` that is neither a volume nor None.
         """
         traits: Any = cls.traits
+        has_attached = False
         if not isinstance(traits, Traits):
             raise TypeError(
                 f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
@@ -178,7 +191,9 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         if not traits.has_parameter_derivatives:
             # What was checked when it was made is not searched again.
             values = _values_without((*args, *kwargs.values()), is_checked)
-            check_no_derivatives(cls.__name__, *values)
+            has_attached = has_derivatives(values)
+            if has_attached:
+                check_no_derivatives(cls.__name__, *_arguments_without(cls, args, kwargs))
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
@@ -186,6 +201,10 @@ class Field(FieldOperators, Parametrized, abc.ABC):
             )
         field = super().__new__(cls)
         record_call(field, args, kwargs)
+        if has_attached:
+            vars(field)[ATTACHED] = True
+            if not any(map(dr.grad_enabled, differentiable_parameters(field))):
+                check_no_derivatives(cls.__name__, *values)  # they are in a form that is not kept
         return field
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -321,7 +340,7 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         if dr.is_array_v(type(points)):
             refuse_hidden_parameters(self)
             if any(dr.grad_enabled(array) for array in (points, *differentiable_parameters(self))):
-                return self.evaluator(backend_of(points)).differentiable_value(points)
+                return value_with_parameters(self, self.evaluator(backend_of(points)), points)
             return self.evaluate(points).value
         return self._evaluate_points(points, precision, lambda sample: sample.value)
 
@@ -332,17 +351,21 @@ class Field(FieldOperators, Parametrized, abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) gives a tensor (n, 3). Both
         have derivatives with respect to the points if these have derivatives enabled and the field
-        defines `hessian`. Raises the errors of `value`, and NotImplementedError if parameters of
-        the field have derivatives enabled.
+        defines `hessian`; and with respect to parameters of formulas and of solids that have
+        formulas (`Traits.differentiable_arguments`). Raises the errors of `value`, and
+        NotImplementedError if other parameters of the field have derivatives enabled.
 
         precision: as for `value`.
         """
         if not dr.is_array_v(type(points)):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         refuse_hidden_parameters(self)
-        check_no_derivatives(
-            f"the gradient of {type(self).__name__}", differentiable_parameters(self)
-        )
+        parameters = differentiable_parameters(self)
+        if ATTACHED in vars(self) and any(map(dr.grad_enabled, parameters)):
+            gradient = gradient_with_parameters(self, self.evaluator(backend_of(points)), points)
+            if gradient is not None:
+                return gradient
+        check_no_derivatives(f"the gradient of {type(self).__name__}", parameters)
         if not dr.grad_enabled(points):
             return self.evaluate(points).gradient
         with dr.suspend_grad():
@@ -398,8 +421,22 @@ def is_checked(value: Any) -> bool:
         type(value) is not float  # the most frequent type
         and isinstance(value, Field)
         and not value.traits.has_parameter_derivatives
+        and ATTACHED not in vars(value)
         and type(value).__module__.startswith("harnack.")
     )
+
+
+def _arguments_without(
+    kind: type[Field], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> list[Any]:
+    """The arguments of a constructor without those of `Traits.differentiable_arguments`; all of
+    them, if they are not arguments of it."""
+    try:
+        bound = inspect.signature(cast("Any", kind).__init__).bind(None, *args, **kwargs)
+    except TypeError:
+        return [*args, *kwargs.values()]
+    names = kind.traits.differentiable_arguments
+    return [value for name, value in bound.arguments.items() if name not in names]
 
 
 def _values_without(values: Iterable[Any], is_left_out: Callable[[Any], bool]) -> list[Any]:
@@ -570,6 +607,11 @@ def refuse_hidden_parameters(field: Field) -> None:
     if field.traits.has_parameter_derivatives and (
         not is_users or any(map(dr.grad_enabled, differentiable_parameters(field)))
     ):
+        return
+    if ATTACHED in vars(field) and not is_users:
+        known = {"_constructor_call", *field.traits.differentiable_arguments}
+        values = {name: value for name, value in vars(field).items() if name not in known}
+        check_no_derivatives(kind.__name__, values)
         return
     check_no_derivatives(kind.__name__, vars(field), kind.evaluate if is_users else None)
 

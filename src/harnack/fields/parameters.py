@@ -37,8 +37,8 @@ class ConstructorCall:
     argument_names: the names of the arguments of the call.
     choices: those of them that are strings, booleans or None, such as method="auto".
     kept: those that are not copied by constructors, such as numbers, functions, volumes and
-        Dr.Jit arrays. NumPy arrays, lists and mappings are not kept: the object stores its own
-        copies as attributes.
+        Dr.Jit arrays. NumPy arrays, and lists and mappings without Dr.Jit arrays, are not kept: the
+        object stores its own copies as attributes.
     """
 
     maker: str = ""
@@ -60,10 +60,13 @@ def _is_choice(value: Any) -> bool:
 
 
 def _is_kept(value: Any) -> bool:
-    """Whether a value is a number, a path, a volume, a field, a function, a dataclass or a Dr.Jit
-    array."""
-    if type(value) in (float, int, tuple):  # the most frequent types
-        return type(value) is not tuple
+    """Whether a value is a number, a path, a volume, a field, a function, a dataclass, a Dr.Jit
+    array, or a tuple, list or dictionary with such arrays."""
+    if type(value) in (float, int):  # the most frequent types
+        return True
+    if isinstance(value, tuple | list | dict):
+        entries = value.values() if isinstance(value, dict) else value
+        return any(_is_drjit(entry) for entry in cast("Any", entries))
     kinds = numbers.Number, os.PathLike, Volume, Parametrized
     is_structure = dataclasses.is_dataclass(value) or _is_drjit(value)
     return isinstance(value, kinds) or callable(value) or is_structure
@@ -236,17 +239,26 @@ class Parametrized:
                 )
 
 
+ATTACHED = "_has_attached_numbers"
+"""The attribute of fields that were made of numbers with derivatives
+(`Traits.differentiable_arguments`), or of such fields. Other fields lack it."""
+
+
 def _keeps_derivatives(instance: Any) -> bool:
-    """Whether an object is a field whose traits say `has_parameter_derivatives`."""
+    """Whether an object is a field whose traits say that some of its parameters may have
+    derivatives."""
     traits = getattr(instance, "traits", None)
-    return traits is not None and traits.has_parameter_derivatives
+    return traits is not None and bool(
+        traits.has_parameter_derivatives or traits.differentiable_arguments
+    )
 
 
 def differentiable_parameters(instance: Parametrized) -> tuple[Any, ...]:
     """The parameters of an object that are Dr.Jit arrays, with respect to which f can be
     differentiated, such as the vertices of a curve that is optimized. There are none unless the
     object is a field whose traits say `has_parameter_derivatives`."""
-    if not _keeps_derivatives(instance):
+    traits = getattr(instance, "traits", None)
+    if traits is None or not (traits.has_parameter_derivatives or ATTACHED in vars(instance)):
         return ()
     return tuple(value for value in instance.parameters().values() if _is_drjit(value))
 

@@ -353,7 +353,7 @@ def _field_to_json(field: Field, sources: FieldSources) -> Plain:
     if isinstance(field, Expression) and isinstance(field.function, TextFormula):
         data: Plain = {
             "formula": field.function.text,
-            "parameters": dict(field.function.parameters),
+            "parameters": dict(field.numbers),
         }
         # Only arguments that differ from their defaults are written.
         keywords = {

@@ -28,6 +28,7 @@ import drjit as dr
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.validation import is_plain_data
 from harnack.enclosures import Levels
+from harnack.fields.attached_numbers import gradient_with_parameters, value_with_parameters
 from harnack.fields.batched_fields import FieldCache
 from harnack.fields.capabilities import EXACT
 from harnack.fields.field import refuse_hidden_parameters
@@ -117,7 +118,7 @@ def attach_derivatives(
     tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
 ) -> tuple[Real, Vec3]:
     """Return the ray parameters t of hits, refined up to rounding, with derivatives attached; and
-    the normals (3,) at these points.
+    the normals (3,) at these points, with derivatives, or such that these are refused.
 
     tracer: the surface.
     o, d: (3,) origins and directions of the rays, possibly with derivatives.
@@ -125,8 +126,9 @@ def attach_derivatives(
     normal: (3,) the unit normals of the trace, which are kept if there is no hit.
 
     Newton's method first moves t to the level. Then -change/slope is the derivative of t, where
-    `change` is a zero whose derivative is that of f - level at fixed t. Normals carry no
-    derivative, which would need the Hessian. At hits on facets, t is exact already and does not
+    `change` is a zero whose derivative is that of f - level at fixed t. The normal is that of the
+    gradient at the point o + t d, as an expression of this point and the field's parameters, where
+    the field has a formula. At hits on facets, t is exact already and does not
     depend on the level.
     """
     # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
@@ -168,10 +170,28 @@ def attach_derivatives(
     change = dr.dot(sample.gradient, point - x)
     if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(tracer.field)):
         # f depends on parameters, too: its own derivative has all of them.
-        value = tracer.evaluator.differentiable_value(point)
+        value = value_with_parameters(tracer.field, tracer.evaluator, point)
         change = value - dr.detach(value)
     change = change - _change_of_nearest(tracer, sample.value)
-    return dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t), normal
+    t = dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t)
+    return t, _with_normal_derivative(tracer, o, d, t, normal, is_hit)
+
+
+def _with_normal_derivative(
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, t: Real, normal: Vec3, is_hit: Mask
+) -> Vec3:
+    """Return the normals with the derivative of the unit vector along the gradient, at points o + t
+    d that move; where this is not known, such that it is refused."""
+    evaluator = tracer.evaluator
+    gradient = None
+    if evaluator.jumps is None and evaluator.patches is None:
+        point = dr.fma(tracer.backend.Array3f(dr.select(is_hit, t, 0)), d, o)
+        gradient = gradient_with_parameters(tracer.field, evaluator, point)
+    if gradient is None:
+        return refuse_derivative(tracer, o, d, "normal", normal)
+    length = norm(gradient)
+    unit = dr.select(is_hit & (length > 0), gradient / length, 0)
+    return dr.replace_grad(normal, unit)
 
 
 def _on_plane(tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:

@@ -209,12 +209,10 @@ def _trace(surface: TracedSurface, rays: RayBatch) -> Hits:
     if not rays.is_numpy and needs_derivatives(tracer, o, d):
         t, normal = attach_derivatives(tracer, o, d, end, hits.normal)
         # Results without a known derivative raise an error if it is used.
-        normal, value, uncertainty = (
+        value, uncertainty = (
             refuse_derivative(tracer, o, d, name, array)
-            for name, array in (
-                ("normal", normal), ("value", hits.value), ("uncertainty", hits.uncertainty),
-            )
-        )  # fmt: skip
+            for name, array in (("value", hits.value), ("uncertainty", hits.uncertainty))
+        )
         position = _positions(o, d, t)
         hits = replace(
             hits, t=t, position=position, normal=normal, value=value, uncertainty=uncertainty

@@ -354,7 +354,6 @@ def trace_crossings(
                 t, zero, arrays.gradient, zero, zero, status, arrays.sheet, arrays.side
             )
         t, normal = attach_derivatives(tracer, o, d, ends, normal)
-        normal = refuse_derivative(tracer, o, d, "normal", normal)
         end = refuse_derivative(tracer, o, d, "traced_to", end)
     position = dr.select(dr.isfinite(t), dr.fma(backend.Array3f(t), d, o), dr.nan)
     side = backend.Int32(arrays.side)

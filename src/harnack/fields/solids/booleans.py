@@ -23,7 +23,7 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import as_finite, no_derivatives
+from harnack.backend.validation import as_finite, as_real, no_derivatives
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
@@ -37,6 +37,7 @@ from harnack.fields.solids.solid import (
     FormulaSolid,
     Solid,
     SolidOfField,
+    by_numbers,
     formula_of,
     not_a_solid,
     without_levels,
@@ -178,6 +179,8 @@ class BooleanSolid(Solid):
     counterexample in the plane are the unit discs about (-1/2, 0) and (1/2, 0): at (0, 0) the
     distance from the border of the union is 0.866, but the minimum is -0.5.
     """
+
+    traits = dataclasses.replace(Solid.traits, differentiable_arguments=("parts",))
 
     parts: tuple[Solid, ...]
     is_union: bool
@@ -532,6 +535,8 @@ class Complement(SolidOfField):
     field: the solid.
     """
 
+    traits = dataclasses.replace(SolidOfField.traits, differentiable_arguments=("field",))
+
     field: Solid
 
     def __post_init__(self) -> None:
@@ -607,6 +612,10 @@ class OffsetSolid(SolidOfField):
     Lipschitz constant of f, are also those of f - distance.
     """
 
+    traits = dataclasses.replace(
+        SolidOfField.traits, differentiable_arguments=("field", "distance")
+    )
+
     field: Solid
     distance: float
 
@@ -676,6 +685,7 @@ def _checked_blend(radius: Any, power: Any) -> tuple[float, float]:
     Raises:
         ValueError: one of them is out of range.
     """
+    radius = as_real(radius, "radius") if dr.is_array_v(type(radius)) else radius
     for name, least, value in (("radius", 0.0, radius), ("power", 1.0, power)):
         is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
         if not is_valid or value == 0:
@@ -700,7 +710,7 @@ class BlendedSolid(FormulaSolid):
     solids grown by the radius.
     """
 
-    traits = dataclasses.replace(FormulaSolid.traits, is_cheap=False)
+    traits = dataclasses.replace(by_numbers("parts", "radius"), is_cheap=False)
     literals = ("power",)  # the ranges of x^p depend on the kind of number that p is
 
     parts: tuple[Solid, Solid]

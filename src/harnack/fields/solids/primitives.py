@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 from harnack.arithmetic import cos, minimum, norm, sin
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend.validation import as_finite, as_positive, as_triple
-from harnack.fields.solids.solid import FormulaSolid, Point, ball_around, box_around, set_frozen
+from harnack.fields.solids.solid import (
+    FormulaSolid,
+    Point,
+    ball_around,
+    box_around,
+    by_numbers,
+    set_frozen,
+)
 
 if TYPE_CHECKING:
     from harnack.geometry import Volume
@@ -30,6 +37,8 @@ class Plane(FormulaSolid):
 
     The gradient of f is n, so that the Lipschitz constant is 1.
     """
+
+    traits = by_numbers("distance")
 
     is_convex = True
 
@@ -61,6 +70,8 @@ class Plane(FormulaSolid):
 class Sphere(FormulaSolid):
     """The ball |x - center| <= radius. f is the signed distance |x - center| - radius (Hart,
     equation 24). By the triangle inequality its Lipschitz constant is 1."""
+
+    traits = by_numbers("radius", "center")
 
     is_convex = True
 
@@ -109,6 +120,8 @@ class Ellipsoid(FormulaSolid):
     form.
     """
 
+    traits = by_numbers("radii")
+
     is_convex = True
 
     radii: Point = (1.0, 1.0, 1.0)
@@ -136,6 +149,8 @@ class Cylinder(FormulaSolid):
     and from the ends have gradients at right angles, so that `orthogonal_intersection` of both is
     the signed distance. The Lipschitz constant is 1.
     """
+
+    traits = by_numbers("radius", "height")
 
     is_convex = True
 
@@ -184,6 +199,8 @@ class DoubleCone(FormulaSolid):
     nearest to p is not beyond the apex, and smaller elsewhere.
     """
 
+    traits = by_numbers("angle")
+
     angle: float = 30.0
 
     lipschitz = 1.0 + 1e-6  # sine and cosine are rounded
@@ -214,6 +231,8 @@ class Torus(FormulaSolid):
     a constant, f has the Lipschitz constant 1. If minor > major (a spindle torus), f is only a
     bound of the distance inside."""
 
+    traits = by_numbers("major", "minor")
+
     major: float = 1.0
     minor: float = 0.25
 
@@ -243,6 +262,8 @@ class Cuboid(FormulaSolid):
     f is computed as the signed distance from a box that is smaller by the radius on each side
     (`orthogonal_intersection`), minus the radius.
     """
+
+    traits = by_numbers("sides", "radius")
 
     is_convex = True
 
@@ -341,6 +362,8 @@ class Superellipsoid(_Powered):
     other radii it is no larger.
     """
 
+    traits = by_numbers("radii")
+
     is_convex = True
 
     powers: tuple[float, float] = (4.0, 4.0)
@@ -375,6 +398,8 @@ class Supertorus(_Powered):
     The Lipschitz constant is that of the norms (`lipschitz_of_norms`), as subtracting `major`
     changes no gradient.
     """
+
+    traits = by_numbers("major", "minor")
 
     powers: tuple[float, float] = (4.0, 4.0)
     major: float = 1.0

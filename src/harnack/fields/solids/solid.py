@@ -207,7 +207,6 @@ class Solid(Field):
 
         return Complement(self)
 
-    @no_derivatives
     def blended(
         self, other: Solid, radius: float, *, power: float = 2.0, intersect: bool = False
     ) -> Solid:
@@ -236,7 +235,6 @@ class Solid(Field):
 
         return BlendedSolid((self, other), radius, power, not intersect)
 
-    @no_derivatives
     def offset(self, distance: float) -> Solid:
         """The solid of the points where f <= distance. If f is a distance, the solid grows by this
         length on all sides, or shrinks if it is negative."""
@@ -259,7 +257,6 @@ class Solid(Field):
 
     # Maps of space. Maps that do not keep lines straight need a formula.
 
-    @no_derivatives
     def translated(self, offset: Sequence[float]) -> Solid:
         """The solid, moved by the vector offset = (x, y, z)."""
         from harnack.fields.solids.transforms import AffineMap
@@ -475,6 +472,12 @@ def formula_of(evaluator: Evaluator) -> FormulaFunction:
     if formula is None:
         raise TypeError(f"{evaluator.name} has no formula")
     return formula
+
+
+def by_numbers(*names: str) -> Traits:
+    """The traits of solids with a formula that uses the numbers of these arguments as they are, so
+    that it can be differentiated by them."""
+    return dataclasses.replace(FormulaSolid.traits, differentiable_arguments=names)
 
 
 class FormulaSolid(Formula, Solid):

@@ -6,6 +6,7 @@ preimage of p, times a factor."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -18,10 +19,11 @@ import numpy.typing as npt
 
 from harnack.arithmetic import Jet
 from harnack.backend.elementary import max_norm, safe_norm
-from harnack.backend.validation import check_no_derivatives
+from harnack.backend.validation import as_triple, check_no_derivatives, has_derivatives
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
+from harnack.fields.attached_numbers import attached, attached_vector
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.formula import own_formula, with_device_numbers
 from harnack.fields.formula_evaluator import (
@@ -58,11 +60,13 @@ class AffineMap(SpaceMap, Parametrized):
         that multiplies all lengths by the same factor) it is that factor, so that a distance stays
         a distance; for other maps it is 1. For a composition of maps it is the product of their
         factors.
+    attached_offset: the translation vector as Dr.Jit numbers with derivatives; None if it has none.
     """
 
     matrix: tuple[tuple[float, ...], ...]
     translation_vector: tuple[float, ...]
     value_factor: float
+    attached_offset: Any = dataclasses.field(default=None, repr=False, compare=False)
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
@@ -110,6 +114,9 @@ class AffineMap(SpaceMap, Parametrized):
     @classmethod
     def translation(cls, offset: Sequence[float]) -> AffineMap:
         """The translation u -> u + offset."""
+        if has_derivatives(offset):
+            plain = cls.of_arrays(np.eye(3), as_triple(offset, "offset"))
+            return replace(plain, attached_offset=offset)
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
@@ -151,7 +158,8 @@ class AffineMap(SpaceMap, Parametrized):
 
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of `of_arrays`."""
-        return {"matrix": self.matrix, "offset": self.translation_vector}
+        offset = self.translation_vector if self.attached_offset is None else self.attached_offset
+        return {"matrix": self.matrix, "offset": offset}
 
     def replace(self, **changes: Any) -> AffineMap:
         """The map of another matrix or offset, by `of_arrays`. The factor of values changes as that
@@ -164,7 +172,10 @@ class AffineMap(SpaceMap, Parametrized):
     def apply(self, solid: Solid) -> Solid:
         """The image of a solid under this map. If the solid is itself the image of another under an
         affine map, the two maps are composed to one."""
-        if isinstance(solid, TransformedSolid):
+        is_attached = self.attached_offset is not None
+        if isinstance(solid, TransformedSolid) and not (
+            is_attached or solid.map.attached_offset is not None
+        ):
             m, b = np.array(self.matrix), np.array(self.translation_vector)
             inner = solid.map
             total = AffineMap.of_arrays(
@@ -242,6 +253,8 @@ class TransformedSolid(SolidOfField):
     inverse_map: the inverse of the map, in Python numbers.
     """
 
+    traits = dataclasses.replace(SolidOfField.traits, differentiable_arguments=("field", "map"))
+
     field: Solid
     map: AffineMap
     inverse_map: _InverseMap = dataclasses.field(init=False, repr=False)
@@ -272,6 +285,16 @@ class TransformedSolid(SolidOfField):
         if (wavelength := self.field.traits.min_wavelength) is not None:
             traits = dataclasses.replace(self.traits, min_wavelength=wavelength / numbers.stretch)
             object.__setattr__(self, "traits", traits)
+
+    def with_attached_numbers(self, backend: Backend) -> TransformedSolid:
+        """The copy whose formula has the attached numbers of the inner solid and of the map."""
+        other = copy.copy(self)
+        object.__setattr__(other, "field", attached(self.field, backend))
+        if self.map.attached_offset is not None:
+            offset = attached_vector(self.map.attached_offset, 3, backend)
+            inverse = replace(self.inverse_map, translation_vector=offset)
+            object.__setattr__(other, "inverse_map", inverse)
+        return other
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         inner_level = level / self.map.value_factor

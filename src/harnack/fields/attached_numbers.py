@@ -1,0 +1,121 @@
+"""Derivatives of formulas by the numbers that they are made of, such as the radius of a sphere.
+
+A field stores Python numbers. If arguments of its constructor were Dr.Jit numbers with derivatives,
+these are kept beside (`fields.parameters`). Here a copy of the field has them in place of its own,
+and its formula, evaluated with plain Dr.Jit numbers, is an expression that Dr.Jit differentiates.
+So this serves fields whose formula uses the attributes of `Traits.differentiable_arguments` as they
+are, and nothing that was computed of them in Python: this would have no derivative."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
+
+import drjit as dr
+
+from harnack.arithmetic.jet import Dual
+from harnack.backend import backend_of
+from harnack.fields.evaluator import Evaluator
+from harnack.fields.parameters import ATTACHED
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, Real, Vec3
+
+__all__ = ["attached", "attached_vector", "gradient_with_parameters", "value_with_parameters"]
+
+
+def value_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Real:
+    """f(p) as an expression that Dr.Jit can differentiate with respect to p and to the parameters
+    of a field. evaluator: that of the field."""
+    if ATTACHED not in vars(field):
+        return evaluator.differentiable_value(p)
+    # By p, the derivative is the gradient of the sample, also at ties.
+    value = Evaluator.differentiable_value(evaluator, p)
+    at = dr.detach(p)
+    own = 0 * at.x + attached(field, backend_of(at)).formula(at.x, at.y, at.z)
+    return value + (own - dr.detach(own))
+
+
+def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 | None:
+    """The gradient at p as an expression that Dr.Jit can differentiate with respect to p and to the
+    parameters of a field (`Traits.differentiable_arguments`); None if the field has no formula for
+    that. At ties of a maximum or minimum it is that of one side. evaluator: that of the field."""
+    formula: Any = getattr(evaluator, "formula", None)
+    if ATTACHED in vars(field):
+        formula = attached(field, backend_of(p)).formula
+    elif formula is None or getattr(evaluator, "uploaded", None) is not None:
+        return None  # a recorded loop runs the instructions of a long formula
+    coordinates = Dual.at_point(p)
+    try:
+        result = coordinates[0].coerce(formula(*coordinates))
+    except TypeError:  # it accepts ranges of derivatives alone
+        return None
+    return type(p)(*(0 * p.x + entry for entry in result.first_derivatives))
+
+
+def attached(value: Any, backend: Backend) -> Any:
+    """A copy of a field, in which arguments with derivatives are in place of the attributes that
+    hold their numbers, in the fields that it is made of as well; or the copy of what contains
+    fields."""
+    if isinstance(value, tuple):
+        return tuple(attached(entry, backend) for entry in cast("tuple[Any, ...]", value))
+    own = getattr(value, "with_attached_numbers", None)
+    if own is not None:
+        return own(backend)
+    if ATTACHED not in getattr(value, "__dict__", {}):
+        return value
+    return with_attached_arguments(value, value.traits.differentiable_arguments, backend)
+
+
+def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend) -> Any:
+    """The copy of a field with its arguments of these names attached (`attached`)."""
+    other, kept = copy.copy(field), vars(field)["_constructor_call"].kept
+    for name in [*vars(other)]:
+        # What was computed of the numbers is computed anew.
+        if isinstance(inspect.getattr_static(type(field), name, None), cached_property):
+            del vars(other)[name]
+    for name in names:
+        number = kept.get(name)
+        old = getattr(field, name)
+        if isinstance(old, Mapping):
+            new: Any = {key: _attached_number((number or {}).get(key, entry), entry, backend)
+                        for key, entry in cast("Any", old).items()}  # fmt: skip
+        else:
+            new = _attached_number(old if number is None else number, old, backend)
+        object.__setattr__(other, name, new)
+    return other
+
+
+def _attached_number(given: Any, old: Any, backend: Backend) -> Any:
+    """The argument `given` in the form of the attribute `old`, a number, a tuple of numbers or what
+    contains fields."""
+    if isinstance(old, float):
+        return attached_vector(given, 1, backend)[0] if _has_array(given) else old
+    if isinstance(old, tuple) and _has_array(given):
+        return attached_vector(given, len(cast("Any", old)), backend)
+    return attached(old, backend)
+
+
+def _has_array(value: Any) -> bool:
+    """Whether a value is a Dr.Jit array, or a tuple or list with such."""
+    entries = cast("Any", value) if isinstance(value, tuple | list) else (value,)
+    return any(dr.is_array_v(cast("Any", type(entry))) for entry in entries)
+
+
+def attached_vector(value: Any, count: int, backend: Backend) -> tuple[Any, ...]:
+    """The numbers of a Dr.Jit vector, array or tensor, or of a tuple of numbers, as numbers of a
+    backend, with their derivatives."""
+    if isinstance(value, tuple | list):
+        entries = [attached_vector(entry, 1, backend)[0] if _has_array(entry)
+                   else backend.Float(entry) for entry in cast("Any", value)]  # fmt: skip
+        return tuple(entries)
+    if dr.is_tensor_v(value):
+        value = value.array
+    if dr.depth_v(value) > 1:
+        return tuple(backend.Float(entry) for entry in value)
+    kind = type(value)
+    index = dr.uint32_array_t(kind)
+    return tuple(backend.Float(dr.gather(kind, value, index(k))) for k in range(count))
