@@ -18,6 +18,7 @@ import drjit as dr
 
 from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
+from harnack.backend.elementary import max_norm
 from harnack.fields.evaluator import Evaluator
 from harnack.fields.parameters import ATTACHED
 
@@ -34,9 +35,24 @@ def value_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Real:
         return evaluator.differentiable_value(p)
     # By p, the derivative is the gradient of the sample, also at ties.
     value = Evaluator.differentiable_value(evaluator, p)
-    at = dr.detach(p)
+    at = _beside(dr.detach(p))
     own = 0 * at.x + attached(field, backend_of(at)).formula(at.x, at.y, at.z)
     return value + (own - dr.detach(own))
+
+
+# How far points are moved off ties, in machine epsilons of their coordinates; and along which
+# vector, so that it is along no tie.
+_TIE_OFFSET, _TIE_DIRECTION = 64.0, (0.71, 0.59, 0.83)
+
+
+def _beside(p: Vec3) -> Vec3:
+    """Points some roundings away from p. Points of a surface often lie on a tie of its formula,
+    such as max(f, 0), where the derivative of an expression is that of neither side; beside it, it
+    is that of one side."""
+    with dr.suspend_grad():
+        length = _TIE_OFFSET * float(dr.epsilon(type(p.x))) * max_norm(dr.detach(p))
+        moved = type(p)(*_TIE_DIRECTION) * length
+    return p + moved
 
 
 def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 | None:
@@ -48,12 +64,15 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
         formula = attached(field, backend_of(p)).formula
     elif formula is None or getattr(evaluator, "uploaded", None) is not None:
         return None  # a recorded loop runs the instructions of a long formula
-    coordinates = Dual.at_point(p)
+    coordinates = Dual.at_point(_beside(p))
     try:
         result = coordinates[0].coerce(formula(*coordinates))
     except TypeError:  # it accepts ranges of derivatives alone
         return None
-    return type(p)(*(0 * p.x + entry for entry in result.first_derivatives))
+    gradient = type(p)(*(0 * p.x + entry for entry in result.first_derivatives))
+    with dr.suspend_grad():
+        value = evaluator.evaluate(dr.detach(p)).gradient
+    return dr.replace_grad(value, gradient)
 
 
 def attached(value: Any, backend: Backend) -> Any:

@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+import drjit as dr
 import numpy as np
 
 from harnack import arithmetic
+from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.validation import as_finite, check_no_derivatives, flag
 from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
 from harnack.fields.formula_evaluator import as_jet
@@ -369,7 +371,13 @@ class Expression(Formula):
         check_no_derivatives("an expression", value)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        return self.function(x, y, z, **self.numbers)
+        numbers: dict[str, Any] = dict(self.numbers)
+        if isinstance(x, FormulaNumber):  # in a product, Dr.Jit's own operators would refuse it
+            numbers = {
+                name: x.coerce(number) if dr.is_array_v(type(number)) else number
+                for name, number in numbers.items()
+            }
+        return self.function(x, y, z, **numbers)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         if self.domain is not None:

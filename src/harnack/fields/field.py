@@ -49,6 +49,7 @@ from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.operators import FieldOperators
 from harnack.fields.parameters import (
     ATTACHED,
+    ConstructorCall,
     Parametrized,
     differentiable_parameters,
     record_call,
@@ -188,12 +189,17 @@ class Field(FieldOperators, Parametrized, abc.ABC):
                 f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
                 "harnack.fields.Traits(...), such as Traits(has_creases=True)"
             )
-        if not traits.has_parameter_derivatives:
+        if traits.has_parameter_derivatives:
+            # They know the derivatives of their own numbers, not those of fields that they are made
+            # of.
+            values = _values_without((*args, *kwargs.values()), is_checked)
+            check_no_derivatives(cls.__name__, [v for v in values if is_attached(v)])
+        else:
             # What was checked when it was made is not searched again.
             values = _values_without((*args, *kwargs.values()), is_checked)
             has_attached = has_derivatives(values)
             if has_attached:
-                check_no_derivatives(cls.__name__, *_arguments_without(cls, args, kwargs))
+                check_no_derivatives(cls.__name__, *_lost_arguments(cls, args, kwargs))
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
@@ -203,8 +209,6 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         record_call(field, args, kwargs)
         if has_attached:
             vars(field)[ATTACHED] = True
-            if not any(map(dr.grad_enabled, differentiable_parameters(field))):
-                check_no_derivatives(cls.__name__, *values)  # they are in a form that is not kept
         return field
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -426,24 +430,42 @@ def is_checked(value: Any) -> bool:
     )
 
 
-def _arguments_without(
+def is_attached(value: Any) -> bool:
+    """Whether a value is a field that was made of numbers with derivatives."""
+    return ATTACHED in getattr(value, "__dict__", {})
+
+
+def _lost_arguments(
     kind: type[Field], args: tuple[Any, ...], kwargs: Mapping[str, Any]
 ) -> list[Any]:
-    """The arguments of a constructor without those of `Traits.differentiable_arguments`; all of
-    them, if they are not arguments of it."""
+    """The arguments of a constructor that may have no derivatives: all but those of
+    `Traits.differentiable_arguments` that are fields, or that are kept as they are."""
     try:
         bound = inspect.signature(cast("Any", kind).__init__).bind(None, *args, **kwargs)
     except TypeError:
         return [*args, *kwargs.values()]
+    arguments = bound.arguments | bound.kwargs
+    kept = ConstructorCall.of("", arguments).kept
     names = kind.traits.differentiable_arguments
-    return [value for name, value in bound.arguments.items() if name not in names]
+    return [
+        value
+        for name, value in arguments.items()
+        if not (name in names and (name in kept or _consists_of_fields(value)))
+    ]
+
+
+def _consists_of_fields(value: Any) -> bool:
+    """Whether a value is a tuple of fields or of maps."""
+    entries = cast("tuple[Any, ...]", value if isinstance(value, tuple) else (value,))
+    return all(isinstance(entry, Parametrized) for entry in entries)
 
 
 def _values_without(values: Iterable[Any], is_left_out: Callable[[Any], bool]) -> list[Any]:
-    """The values, and in place of tuples what is in them, without those that are left out."""
+    """The values, and in place of tuples and lists what is in them, without those that are left
+    out."""
     kept: list[Any] = []
     for value in values:
-        entries = cast("tuple[Any, ...]", value if type(value) is tuple else (value,))
+        entries = cast("tuple[Any, ...]", value if type(value) in (tuple, list) else (value,))
         kept += [entry for entry in entries if not is_left_out(entry)]
     return kept
 
