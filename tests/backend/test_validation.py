@@ -158,7 +158,7 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
         "^each part of an intersection must be a volume",
     ),
     "end of a slider": (lambda: hk.Slider(None, 1.0), "^low must be a number"),
-    "twice a field": (lambda: 2 * SPHERE, "the level c of 2 f is the level c/2 of f"),
+    "twice a field": (lambda: 2 * SPHERE, "a Sphere is a set of points: solids are combined"),
     "a field less than": (lambda: hk.Gyroid() < 0, "is a function of space"),
 }
 

@@ -59,6 +59,12 @@ OTHERS: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
 }
 
 
+class Learned(float):
+    """A number as PyTorch has them."""
+
+    requires_grad = True
+
+
 def solids() -> Iterator[Any]:
     for name, kind in vars(hk.solids).items():
         if inspect.isclass(kind) and issubclass(kind, hk.fields.Field):
@@ -140,6 +146,9 @@ def test_numbers_that_would_be_lost_are_refused() -> None:
         lambda: hk.solids.struts([[0, 0, 0], [1, 0, 0]], [[0, 1]], r),
         lambda: hk.fields.FieldSum([hk.Sphere(r), hk.Sphere(1.0)], [1, 1]),
         lambda: hk.expression(lambda x, y, z: x - r),
+        lambda: hk.expression("x - a", a=Learned(0.5)),
+        lambda: hk.Sphere(Learned(0.5)),
+        lambda: hk.Sphere(0.3).blended(BOX, 0.1, power=r),
         lambda: hk.smooth_union([hk.Sphere(r), hk.Sphere(1.0)], 0.1),
     ):
         with pytest.raises(NotImplementedError, match="carry"):
@@ -158,3 +167,21 @@ def test_tensors_and_lists_are_attached() -> None:
         dr.set_grad(x, 0.0)
         dr.backward(hk.Sphere(0.5, center).value(Array3f64(1.0, 0.2, 0.3)))
         np.testing.assert_allclose(dr.grad(x), [-1], atol=1e-12)
+
+
+def test_normals_move_with_rays_and_levels() -> None:
+    x, level = Float64(0.3), Float64(0.1)
+    dr.enable_grad(x, level)
+    hits = hk.trace(hk.Sphere(0.9), Array3f64(x, 0.0, 3.0), Array3f64(0, 0, -1), level=level)
+    dr.backward(hits.normal.x)  # x / (0.9 + level)
+    np.testing.assert_allclose(dr.grad(x), [1.0], atol=1e-9)
+    np.testing.assert_allclose(dr.grad(level), [-0.3], atol=1e-9)
+
+
+def test_normals_by_weights_are_refused() -> None:
+    weight = Float64(2.0)
+    dr.enable_grad(weight)
+    surface = hk.expression("x^2 + y^2 - z") * weight
+    hits = hk.trace(surface, Array3f64(0.3, 0.0, 3.0), Array3f64(0, 0, -1), level=0.1)
+    with pytest.raises(Exception, match="normal of hits cannot be differentiated"):
+        dr.backward(hits.normal.x)

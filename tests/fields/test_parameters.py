@@ -190,8 +190,8 @@ _CASES: dict[str, _Case] = {
     "level curves": (hk.fields.LevelCurves, {"function": "log", "argument": {1: 1, -1: -1}},
                      {"argument.1", "argument.-1", "level"}, ("level", 0.2, {"level": 0.2})),
     "formula": (lambda a: hk.expression("x^2 + a*y = 1", parameters={"a": a}), {"a": 1.0},
-                {"function.parameters.a", "default_level"},
-                ("function.parameters.a", 2.0, {"a": 2.0})),
+                {"numbers.a", "default_level"},
+                ("numbers.a", 2.0, {"a": 2.0})),
     "blobs": (blobs, {"centers": _POINTS, "radii": 0.5, "groups": [0, 1] * 6},
               {"centers", "radii", "weights", "kernel.support", "groups"},
               ("radii", 0.4, {"radii": 0.4})),
@@ -302,7 +302,7 @@ def test_an_unknown_name_is_refused_with_a_suggestion() -> None:
         with pytest.raises(TypeError, match=f'did you mean "{re.escape(name)}"'):
             moved.replace(**{part: 1.0})
     text = hk.expression("x^2 + a*y = b", parameters={"a": 1.0, "b": 0.5})
-    with pytest.raises(TypeError, match=r'an Expression has .* mean "function\.parameters\.a"'):
+    with pytest.raises(TypeError, match=r'an Expression has .* mean "numbers\.a"'):
         text.replace(a=1.4)
     with pytest.raises(TypeError, match='did you mean "default_level"'):
         text.replace(level=0.2)
@@ -322,7 +322,7 @@ def test_the_constructor_checks_what_is_exchanged() -> None:
             field.replace(domain=3)
     formula = hk.expression("x^2 + a*y = 1", parameters={"a": 1.0})
     with pytest.raises(ValueError, match="a must be"):
-        formula.replace(**{"function.parameters.a": math.nan})
+        formula.replace(**{"numbers.a": math.nan})
     with pytest.raises(ValueError, match="distance must be"):
         hk.Sphere().offset(0.1).replace(distance=math.inf)
     with pytest.raises(ValueError, match="half_width must be positive"):
@@ -416,8 +416,10 @@ def test_derivatives_are_refused_or_kept() -> None:
     matrix = backend.Array3f(1, 2, 3)
     loop = backend.Array3f(np.array(_TRIANGLE).T)
     dr.enable_grad(number, matrix, loop)
-    with pytest.raises(NotImplementedError, match="Sphere cannot be differentiated"):
-        hk.Sphere().replace(radius=number)
+    sphere = hk.Sphere().replace(radius=number)
+    assert differentiable_parameters(sphere) == (number,)
+    with pytest.raises(NotImplementedError, match="Capsule cannot be differentiated"):
+        hk.Capsule().replace(radius=number)
     with pytest.raises(NotImplementedError, match="cannot be differentiated"):
         hk.Torus().scaled(2.0).replace(**{"map.offset": matrix})
     with pytest.raises(NotImplementedError, match="cannot be differentiated"):

@@ -20,7 +20,7 @@ from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
 from harnack.backend.elementary import max_norm
 from harnack.fields.evaluator import Evaluator
-from harnack.fields.parameters import ATTACHED
+from harnack.fields.parameters import ATTACHED, differentiable_parameters
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -64,6 +64,8 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
         formula = attached(field, backend_of(p)).formula
     elif formula is None or getattr(evaluator, "uploaded", None) is not None:
         return None  # a recorded loop runs the instructions of a long formula
+    elif any(map(dr.grad_enabled, differentiable_parameters(field))):
+        return None  # such as weights of a sum, which are no numbers of its formula
     coordinates = Dual.at_point(_beside(p))
     try:
         result = coordinates[0].coerce(formula(*coordinates))
@@ -91,8 +93,10 @@ def attached(value: Any, backend: Backend) -> Any:
 
 def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend) -> Any:
     """The copy of a field with its arguments of these names attached (`attached`)."""
-    other, kept = copy.copy(field), vars(field)["_constructor_call"].kept
-    for name in [*vars(other)]:
+    other: Any = copy.copy(field)
+    call: Any = vars(field)["_constructor_call"]
+    kept: dict[str, Any] = call.kept
+    for name in list(cast("dict[str, Any]", vars(other))):
         # What was computed of the numbers is computed anew.
         if isinstance(inspect.getattr_static(type(field), name, None), cached_property):
             del vars(other)[name]
@@ -135,6 +139,6 @@ def attached_vector(value: Any, count: int, backend: Backend) -> tuple[Any, ...]
         value = value.array
     if dr.depth_v(value) > 1:
         return tuple(backend.Float(entry) for entry in value)
-    kind = type(value)
+    kind: Any = type(value)
     index = dr.uint32_array_t(kind)
     return tuple(backend.Float(dr.gather(kind, value, index(k))) for k in range(count))

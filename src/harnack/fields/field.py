@@ -49,7 +49,6 @@ from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.operators import FieldOperators
 from harnack.fields.parameters import (
     ATTACHED,
-    ConstructorCall,
     Parametrized,
     differentiable_parameters,
     record_call,
@@ -183,7 +182,7 @@ class Field(FieldOperators, Parametrized, abc.ABC):
                 `Traits`; or an argument `domain` that is neither a volume nor None.
         """
         traits: Any = cls.traits
-        has_attached = False
+        attached: dict[str, Any] = {}
         if not isinstance(traits, Traits):
             raise TypeError(
                 f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
@@ -197,9 +196,8 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         else:
             # What was checked when it was made is not searched again.
             values = _values_without((*args, *kwargs.values()), is_checked)
-            has_attached = has_derivatives(values)
-            if has_attached:
-                check_no_derivatives(cls.__name__, *_lost_arguments(cls, args, kwargs))
+            if has_derivatives(values):
+                attached = _attached_arguments(cls, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "
@@ -207,8 +205,9 @@ class Field(FieldOperators, Parametrized, abc.ABC):
             )
         field = super().__new__(cls)
         record_call(field, args, kwargs)
-        if has_attached:
+        if attached:
             vars(field)[ATTACHED] = True
+            vars(field)["_constructor_call"].kept.update(attached)
         return field
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -435,29 +434,39 @@ def is_attached(value: Any) -> bool:
     return ATTACHED in getattr(value, "__dict__", {})
 
 
-def _lost_arguments(
+def _attached_arguments(
     kind: type[Field], args: tuple[Any, ...], kwargs: Mapping[str, Any]
-) -> list[Any]:
-    """The arguments of a constructor that may have no derivatives: all but those of
-    `Traits.differentiable_arguments` that are fields, or that are kept as they are."""
+) -> dict[str, Any]:
+    """The arguments of a constructor with derivatives by which f can be differentiated: those of
+    `Traits.differentiable_arguments` that are Dr.Jit numbers, tuples, lists or mappings of such, or
+    fields that are made of such.
+
+    Raises:
+        NotImplementedError: other arguments have derivatives enabled.
+    """
     try:
         bound = inspect.signature(cast("Any", kind).__init__).bind(None, *args, **kwargs)
     except TypeError:
-        return [*args, *kwargs.values()]
-    arguments = bound.arguments | bound.kwargs
-    kept = ConstructorCall.of("", arguments).kept
-    names = kind.traits.differentiable_arguments
-    return [
-        value
-        for name, value in arguments.items()
-        if not (name in names and (name in kept or _consists_of_fields(value)))
-    ]
+        check_no_derivatives(kind.__name__, args, kwargs)
+        return {}
+    known = {
+        name: value
+        for name, value in bound.arguments.items()
+        if name in kind.traits.differentiable_arguments and _is_attachable(value)
+    }
+    others = [value for name, value in bound.arguments.items() if name not in known]
+    check_no_derivatives(kind.__name__, *others)
+    return known
 
 
-def _consists_of_fields(value: Any) -> bool:
-    """Whether a value is a tuple of fields or of maps."""
-    entries = cast("tuple[Any, ...]", value if isinstance(value, tuple) else (value,))
-    return all(isinstance(entry, Parametrized) for entry in entries)
+def _is_attachable(value: Any) -> bool:
+    """Whether all derivatives of a value are those of Dr.Jit numbers, or of fields and maps."""
+    if isinstance(value, Mapping):
+        return all(map(_is_attachable, cast("Any", value).values()))
+    if isinstance(value, tuple | list):
+        return all(map(_is_attachable, cast("Any", value)))
+    is_known = dr.is_array_v(type(value)) or isinstance(value, Parametrized)
+    return is_known or not has_derivatives(value)
 
 
 def _values_without(values: Iterable[Any], is_left_out: Callable[[Any], bool]) -> list[Any]:

@@ -37,8 +37,9 @@ class ConstructorCall:
     argument_names: the names of the arguments of the call.
     choices: those of them that are strings, booleans or None, such as method="auto".
     kept: those that are not copied by constructors, such as numbers, functions, volumes and
-        Dr.Jit arrays. NumPy arrays, and lists and mappings without Dr.Jit arrays, are not kept: the
-        object stores its own copies as attributes.
+        Dr.Jit arrays. NumPy arrays, lists and mappings are not kept: the object stores its own
+        copies as attributes. (But those with Dr.Jit numbers in them are, where a field has
+        derivatives by these.)
     """
 
     maker: str = ""
@@ -60,13 +61,10 @@ def _is_choice(value: Any) -> bool:
 
 
 def _is_kept(value: Any) -> bool:
-    """Whether a value is a number, a path, a volume, a field, a function, a dataclass, a Dr.Jit
-    array, or a tuple, list or dictionary with such arrays."""
-    if type(value) in (float, int):  # the most frequent types
-        return True
-    if isinstance(value, tuple | list | dict):
-        entries = value.values() if isinstance(value, dict) else value
-        return any(_is_drjit(entry) for entry in cast("Any", entries))
+    """Whether a value is a number, a path, a volume, a field, a function, a dataclass or a Dr.Jit
+    array."""
+    if type(value) in (float, int, tuple):  # the most frequent types
+        return type(value) is not tuple
     kinds = numbers.Number, os.PathLike, Volume, Parametrized
     is_structure = dataclasses.is_dataclass(value) or _is_drjit(value)
     return isinstance(value, kinds) or callable(value) or is_structure

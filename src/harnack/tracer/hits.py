@@ -148,11 +148,11 @@ def trace(
     precision, unless `precision` says otherwise. To find further crossings beyond the first hit,
     use `crossings`.
 
-    With Dr.Jit rays, t and position carry derivatives with respect to rays, level, and vertices of
-    a `SolidAngle`, if these have derivatives enabled (implicit differentiation at the hit). The
-    other results have no derivatives: in reverse mode, using their derivatives raises
-    NotImplementedError; in forward mode they are NaN. Fields raise an error if other numbers of
-    theirs have derivatives enabled.
+    With Dr.Jit rays, t and position carry derivatives with respect to rays, level, vertices of a
+    `SolidAngle`, and numbers of formulas and solids, if these have derivatives enabled (implicit
+    differentiation at the hit); and so do normals of formulas and solids. The other results have no
+    derivatives: in reverse mode, using their derivatives raises NotImplementedError; in forward
+    mode they are NaN. Fields raise an error if other numbers of theirs have derivatives enabled.
 
     With `backend="webgpu"`, NumPy rays are traced in single precision by the package `wgpu` (`pip
     install harnack[webgpu]`) with a translation of the kernel that Dr.Jit records. Rounding is
