@@ -50,6 +50,7 @@ FIELD_ROOMS = (
     "operators",
     "batch_evaluation",
     "evaluator",
+    "attached_numbers",
     "field",
     "formula_evaluator",
     "vm_formulas",

@@ -20,7 +20,12 @@ from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
 from harnack.backend.elementary import max_norm
 from harnack.fields.evaluator import Evaluator
-from harnack.fields.parameters import ATTACHED, differentiable_parameters
+from harnack.fields.parameters import (
+    ATTACHED,
+    attributes_of,
+    differentiable_parameters,
+    kept_arguments,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
@@ -93,13 +98,11 @@ def attached(value: Any, backend: Backend) -> Any:
 
 def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend) -> Any:
     """The copy of a field with its arguments of these names attached (`attached`)."""
-    other: Any = copy.copy(field)
-    call: Any = vars(field)["_constructor_call"]
-    kept: dict[str, Any] = call.kept
-    for name in list(cast("dict[str, Any]", vars(other))):
+    other, kept = copy.copy(field), kept_arguments(field)
+    for name in list(attributes_of(other)):
         # What was computed of the numbers is computed anew.
         if isinstance(inspect.getattr_static(type(field), name, None), cached_property):
-            del vars(other)[name]
+            del attributes_of(other)[name]
     for name in names:
         number = kept.get(name)
         old = getattr(field, name)
@@ -139,6 +142,6 @@ def attached_vector(value: Any, count: int, backend: Backend) -> tuple[Any, ...]
         value = value.array
     if dr.depth_v(value) > 1:
         return tuple(backend.Float(entry) for entry in value)
-    kind: Any = type(value)
+    kind = cast("Any", type(value))
     index = dr.uint32_array_t(kind)
     return tuple(backend.Float(dr.gather(kind, value, index(k))) for k in range(count))

@@ -137,6 +137,17 @@ def _call_of(instance: object) -> ConstructorCall:
     return vars(instance).get("_constructor_call", ConstructorCall())
 
 
+def kept_arguments(instance: object) -> dict[str, Any]:
+    """The arguments of the call that made an object that are kept as they were given
+    (`ConstructorCall`)."""
+    return _call_of(instance).kept
+
+
+def attributes_of(instance: object) -> dict[str, Any]:
+    """The attributes of an object, which may be changed."""
+    return vars(instance)
+
+
 class Parametrized:
     """An object whose parameters, the numbers and arrays in the arguments of its constructor, have
     names."""
