@@ -107,8 +107,9 @@ def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend
         number = kept.get(name)
         old = getattr(field, name)
         if isinstance(old, Mapping):
-            new: Any = {key: _attached_number((number or {}).get(key, entry), entry, backend)
-                        for key, entry in cast("Any", old).items()}  # fmt: skip
+            own: dict[str, Any] = number or {}
+            entries = cast("Any", old).items()
+            new: Any = {k: _attached_number(own.get(k, e), e, backend) for k, e in entries}
         else:
             new = _attached_number(old if number is None else number, old, backend)
         object.__setattr__(other, name, new)
