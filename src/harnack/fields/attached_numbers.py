@@ -30,7 +30,13 @@ from harnack.fields.parameters import (
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
 
-__all__ = ["attached", "attached_vector", "gradient_with_parameters", "value_with_parameters"]
+__all__ = [
+    "attached",
+    "attached_vector",
+    "gradient_with_parameters",
+    "value_with_parameters",
+    "with_attached_arguments",
+]
 
 
 def value_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Real:
@@ -88,11 +94,11 @@ def attached(value: Any, backend: Backend) -> Any:
     fields."""
     if isinstance(value, tuple):
         return tuple(attached(entry, backend) for entry in cast("tuple[Any, ...]", value))
+    if ATTACHED not in getattr(value, "__dict__", {}):
+        return value
     own = getattr(value, "with_attached_numbers", None)
     if own is not None:
         return own(backend)
-    if ATTACHED not in getattr(value, "__dict__", {}):
-        return value
     return with_attached_arguments(value, value.traits.differentiable_arguments, backend)
 
 
@@ -101,7 +107,9 @@ def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend
     other, kept = copy.copy(field), kept_arguments(field)
     for name in list(attributes_of(other)):
         # What was computed of the numbers is computed anew.
-        if isinstance(inspect.getattr_static(type(field), name, None), cached_property):
+        if isinstance(
+            inspect.getattr_static(cast("Any", type(field)), name, None), cached_property
+        ):
             del attributes_of(other)[name]
     for name in names:
         number = kept.get(name)

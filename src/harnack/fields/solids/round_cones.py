@@ -5,21 +5,30 @@ networks of struts are unions of many (`harnack.fields.solids.struts`)."""
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import operator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harnack.arithmetic import cone_distance, norm, segment_distance
+from harnack.arithmetic import cone_distance, maximum, minimum, norm, segment_distance
 from harnack.backend.validation import as_positive, as_triple
-from harnack.fields.solids.solid import FormulaSolid, Point, box_around, set_frozen
+from harnack.fields.attached_numbers import with_attached_arguments
+from harnack.fields.solids.solid import (
+    FormulaSolid,
+    Point,
+    box_around,
+    by_numbers,
+    set_frozen,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.arithmetic.segments import Frame
-    from harnack.backend import BoolArray, FloatArray
+    from harnack.backend import Backend, BoolArray, FloatArray
     from harnack.geometry import Volume
 
 
@@ -72,6 +81,7 @@ class Capsule(FormulaSolid):
 
     # The unit vectors of the frame are rounded.
     lipschitz = 1.0 + 1e-6
+    traits = by_numbers("start", "end", "radius")
 
     start: Point = (0.0, 0.0, -1.0)
     end: Point = (0.0, 0.0, 1.0)
@@ -101,6 +111,11 @@ class Capsule(FormulaSolid):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return segment_distance((x, y, z), self._frame, self._half_length) - self.radius
+
+    def with_attached_numbers(self, backend: Backend) -> _PlainCone:
+        """The same function of the numbers with their derivatives."""
+        numbers = with_attached_arguments(self, ("start", "end", "radius"), backend)
+        return _PlainCone((numbers.start, numbers.end), (numbers.radius, numbers.radius))
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box of the segment, grown by radius
@@ -142,6 +157,7 @@ class RoundCone(FormulaSolid):
 
     # The unit vectors of the frame and the slope are rounded.
     lipschitz = 1.0 + 1e-6
+    traits = by_numbers("start", "end", "radii")
 
     start: Point = (0.0, 0.0, -1.0)
     end: Point = (0.0, 0.0, 1.0)
@@ -183,6 +199,14 @@ class RoundCone(FormulaSolid):
             return norm(x, y, z) - radius
         return cone_distance((x, y, z), self._frame, length, slope, ratio) - radius
 
+    def with_attached_numbers(self, backend: Backend) -> _PlainCone:
+        """The same function of the numbers with their derivatives."""
+        numbers = with_attached_arguments(self, ("start", "end", "radii"), backend)
+        ends, radii = (numbers.start, numbers.end), numbers.radii
+        if self.radii[1] > self.radii[0]:
+            ends, radii = ends[::-1], radii[::-1]
+        return _PlainCone(ends, radii, self._is_ball)
+
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box around both balls, each with
         the level added to its radius. (The sides of the balls between them vary linearly.) None if
@@ -191,6 +215,37 @@ class RoundCone(FormulaSolid):
             return None
         first, second = self.radii
         return _box_around_balls((self.start, self.end), (first + level, second + level))
+
+
+@dataclass(frozen=True)
+class _PlainCone:
+    """The function of a round cone or capsule, computed from its numbers, which may be those of
+    Dr.Jit with derivatives.
+
+    ends: the center of the larger ball, and that of the other one.
+    radii: theirs, in that order.
+    is_ball: whether the larger ball contains the other one.
+    """
+
+    ends: tuple[tuple[Any, ...], ...]
+    radii: tuple[Any, Any]
+    is_ball: bool = False
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z)."""
+        (start, end), (large, small) = self.ends, self.radii
+        away = [v - a for v, a in zip((x, y, z), start, strict=True)]
+        if self.is_ball:
+            return norm(*away) - large
+        axis = [b - a for a, b in zip(start, end, strict=True)]
+        length = norm(*axis)
+        axis = [component / length for component in axis]
+        slope = (large - small) / length
+        along = functools.reduce(operator.add, [a * b for a, b in zip(away, axis, strict=True)])
+        across = norm(*(a - along * b for a, b in zip(away, axis, strict=True)))
+        ratio = slope / (1.0 - slope * slope) ** 0.5
+        t = minimum(maximum(along - across * ratio, 0.0), length)
+        return norm(across, along - t) + t * slope - large
 
 
 def _checked_radii(radii: Any) -> tuple[float, float]:
