@@ -152,28 +152,22 @@ def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
         + _WRITES * is_written
         + _BEGINS * begins
     )
-    own: Any = np.stack(
-        [
-            kinds | slots << _SLOT_BITS,
-            slots[operand] | slots[third] << _SLOT_BITS,
-            row_of[instructions],
-            flags,
-        ],
-        axis=1,
-    )
-    load = np.stack(
-        [
-            np.full(count, len(tape.operations)),
-            slots[loaded],
-            np.zeros(count, np.int64),
-            np.full(count, _READS + _FIRST),
-        ],
-        axis=1,
-    )
-    both = np.stack([load, own], axis=1).reshape(-1, _WORDS)
-    is_present: Any = np.stack([loads | is_plain_load, is_run], axis=1)
-    before = np.concatenate([[0], np.cumsum(is_present.sum(axis=1))])
-    return both[is_present.ravel()], before, slot_count
+    is_load: Any = loads | is_plain_load
+    counts = is_load.astype(np.int32) + is_run
+    before = np.concatenate([[0], np.cumsum(counts)])
+    words = np.zeros((before[-1], _WORDS), np.uint32)
+    # The instruction of an entry comes after that which reads its second operand.
+    run = np.flatnonzero(is_run)
+    places = before[run] + is_load[run]
+    words[places, 0] = kinds[run] | slots[run] << _SLOT_BITS
+    words[places, 1] = (slots[operand] | slots[third] << _SLOT_BITS)[run]
+    words[places, 2] = row_of[instructions[run]]
+    words[places, 3] = flags[run]
+    read = np.flatnonzero(is_load)
+    words[before[read], 0] = len(tape.operations)
+    words[before[read], 1] = slots[loaded[read]]
+    words[before[read], 3] = _READS + _FIRST
+    return words, before, slot_count
 
 
 def _rows_of_constants(tape: Tape) -> BoolArray:
