@@ -1,8 +1,8 @@
-"""Small networks that equal a ReLU network in the cells of a grid. In a small cell most neurons are
-proved to be active, a(z) = z, or dead, a(z) = 0 (`box_ranges`). So in the cell all values of a layer
-are affine functions of the point and of the values s = max(z, 0) of the *open* neurons, the few
-others of earlier layers. The network of a cell has only these: layers of open neurons, and linear
-neurons, which hand the point and earlier s on to the next layer.
+"""Small networks that equal a ReLU network in the cells of a grid. In a small cell most neurons
+are proved to be active, a(z) = z, or dead, a(z) = 0 (`box_ranges`). So in the cell all values of a
+layer are affine functions of the point and of the values s = max(z, 0) of the *open* neurons, the
+few others of earlier layers. The network of a cell has only these: layers of open neurons, and
+linear neurons, which hand the point and earlier s on to the next layer.
 
 **Errors.** Coefficients are computed in double precision. Let x be a point of the cell, s the
 values of open neurons as the small network has them, and v = V (1, x, s) the values of a layer that
@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from harnack.fields.networks.box_ranges import ranges_in_boxes, with_columns
+from harnack.fields.networks.box_ranges import ranges_in_boxes, with_rows
 from harnack.fields.networks.layer_tables import (
     INPUTS,
     ROWS,
@@ -48,7 +48,7 @@ Layer: TypeAlias = "tuple[FloatArray, FloatArray]"
 
 _UNIT = 2.0**-53
 # So many cells are treated at once.
-_CELLS_AT_ONCE = 256
+_CELLS_AT_ONCE = 384
 
 
 def networks_of_cells(
@@ -76,18 +76,17 @@ def networks_of_cells(
             values, rows = values.after(layer, norms[index], active, ~(active | dead))
             for network, own in zip(found, rows, strict=True):
                 network.append(_layer_of(own, activation, index, len(layers) - 2))
-        values, rows = values.after(
-            layers[-1], norms[-1], *[np.ones((1, len(part.corners)), bool)] * 2
-        )
+        is_output = np.ones((len(part.corners), 1), np.bool_)
+        _, rows = values.after(layers[-1], norms[-1], is_output, is_output)
         networks += [_with_output(*pair) for pair in zip(found, rows, strict=True)]
     return networks
 
 
 def _weight_count(open_: Sequence[BoolArray]) -> int:
     """The number of weights, with padding, of networks with these open neurons."""
-    before, count = np.full(open_[0].shape[1], INPUTS), 0
+    before, count = np.full(len(open_[0]), INPUTS), 0
     for index, mask in enumerate(open_):
-        after = before + mask.sum(axis=0)
+        after = before + mask.sum(axis=1)
         is_last = index == len(open_) - 1 and index > 0
         count += _padded(before) * _padded(after - before if is_last else after)
         before = after
@@ -115,8 +114,8 @@ class _Rows:
 class _Values:
     """Values of a layer in n cells, as affine functions.
 
-    numbers: (k, columns) for each cell a run of columns: V. starts: (n,) their first columns.
-    sizes: (columns,) c. errors: (n,) e.
+    numbers: (rows, k) for each cell a run of rows: V'. starts: (n,) their first rows.
+    sizes: (rows,) c. errors: (n,) e.
     """
 
     numbers: FloatArray
@@ -128,12 +127,12 @@ class _Values:
     def of_boxes(cls, boxes: BoxCells) -> _Values:
         """The coordinates in boxes."""
         count = len(boxes.corners)
-        numbers = np.zeros((INPUTS, (1 + INPUTS) * count))
+        numbers = np.zeros(((1 + INPUTS) * count, INPUTS))
         sizes = np.ones((count, 1 + INPUTS))
         farthest = np.maximum(np.abs(boxes.corners), np.abs(boxes.corners + boxes.size))
         sizes[:, 1:] = np.maximum(1.001 * farthest, 1)
         for k in range(INPUTS):
-            numbers[k, k + 1 :: 1 + INPUTS] = 1
+            numbers[k + 1 :: 1 + INPUTS, k] = 1
         starts = (1 + INPUTS) * np.arange(count)
         return cls(numbers, starts, sizes.ravel(), np.zeros(count))
 
@@ -142,30 +141,30 @@ class _Values:
     ) -> tuple[_Values, list[_Rows]]:
         """The values of the next layer, and for each cell its open neurons.
 
-        norm: a bound of the spectral norm. active, open_: (m, n) masks of neurons.
+        norm: a bound of the spectral norm. active, open_: (n, m) masks of neurons.
         """
         weights, bias = layer
-        numbers = weights @ self.numbers
-        numbers[:, self.starts] += bias[:, None]
-        size = np.add.reduceat(np.abs(self.numbers) * self.sizes, self.starts, axis=1)
+        numbers = self.numbers @ weights.T
+        numbers[self.starts] += bias
+        size = np.add.reduceat(np.abs(self.numbers) * self.sizes[:, None], self.starts, axis=0)
         unit = 1.01 * _UNIT * (weights.shape[1] + 16)
-        new = np.linalg.norm(weights) * np.linalg.norm(size, axis=0) + np.linalg.norm(bias)
+        new = np.linalg.norm(weights) * np.linalg.norm(size, axis=1) + np.linalg.norm(bias)
         errors = norm * self.errors + unit * new
-        ends = np.append(self.starts[1:], numbers.shape[1])
-        box, row = np.nonzero(open_.T)
-        firsts = np.searchsorted(box, np.arange(len(self.starts) + 1))
+        counts = np.diff(self.starts, append=len(numbers))
         rows: list[_Rows] = []
         bounds: list[FloatArray] = []
-        for k, (start, end) in enumerate(zip(self.starts, ends, strict=True)):
-            own = numbers[row[firsts[k] : firsts[k + 1]], start:end]
+        for k, (start, count) in enumerate(zip(self.starts, counts, strict=True)):
+            own = numbers[start : start + count, open_[k]].T
             rows.append(_Rows(own, float(errors[k])))
-            bounds.append(1.001 * (np.abs(own) @ self.sizes[start:end]))
-        kept = numbers * np.repeat(active, ends - self.starts, axis=1)
-        wider, starts, columns = with_columns(kept, self.starts, np.diff(firsts))
-        wider[row, columns] = 1
-        sizes, _, _ = with_columns(self.sizes[None], self.starts, np.diff(firsts))
-        sizes[0, columns] = np.concatenate(bounds)
-        return _Values(wider, starts, sizes[0], errors), rows
+            bounds.append(1.001 * (np.abs(own) @ self.sizes[start : start + count]))
+        more = open_.sum(axis=1)
+        wider, starts, new_rows = with_rows(
+            numbers * np.repeat(active, counts, axis=0), self.starts, more
+        )
+        wider[new_rows, np.nonzero(open_)[1]] = 1
+        sizes, _, _ = with_rows(self.sizes, self.starts, more)
+        sizes[new_rows] = np.concatenate(bounds)
+        return _Values(wider, starts, sizes, errors), rows
 
 
 def _layer_of(rows: _Rows, activation: Activation, index: int, last: int) -> NetworkLayer:

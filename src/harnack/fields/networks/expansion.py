@@ -249,7 +249,7 @@ class _Forward:
         x, z = tables.multiply(
             self.memory.x,
             self.memory.z,
-            layer.forward,
+            layer.weights,
             layer.columns,
             layer.rows,
             len(self.lengths),
@@ -352,7 +352,7 @@ class _Forward:
                 (u(0), x, z, kept, sums, [zero] * 3), lambda s: s[0] < layer.count, step, "back"
             )
             error = dr.fma(2 * unit * _ROUND_UP, dr.sqrt(norms[1]), error)
-            z, x = tables.multiply(z, x, layer.backward, layer.back_columns, layer.back_rows)
+            z[0], x[0] = tables.multiply_back(z[0], x[0], layer)
             norm = dr.sqrt(norms[0]) * _ROUND_UP
             own = (layer.backward_error * layer.frobenius + 2 * unit * layer.spectral) * norm
             error = dr.fma(norms[2] * layer.spectral * _ROUND_UP, error, own * _ROUND_UP)

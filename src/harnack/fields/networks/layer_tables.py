@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
 from harnack.backend.arrays import upload_floats, upload_integers
 from harnack.backend.local_memory import local_size
@@ -103,9 +104,8 @@ class LayerNumbers:
     first: the index of its first neuron in tables of neurons.
     place: the same in local memory, which holds the neurons of a single network.
     count: the number of its neurons, with padding.
-    forward, backward: the first packets of W and of its transpose.
+    weights: the first packet of W.
     columns, rows: the numbers of iterations for the columns of W, and of its blocks of rows.
-    back_columns, back_rows: those of the transpose.
     kind: the index of the activation function.
     parameter, max_slope: of the activation function.
     spectral, frobenius: bounds of these norms of W.
@@ -118,12 +118,9 @@ class LayerNumbers:
     first: Index
     place: Index
     count: Index
-    forward: Index
-    backward: Index
+    weights: Index
     columns: Index
     rows: Index
-    back_columns: Index
-    back_rows: Index
     kind: Index
     parameter: Real
     max_slope: Real
@@ -135,10 +132,7 @@ class LayerNumbers:
     output_norm: Real
 
 
-_INTEGERS = (
-    "first", "place", "count", "forward", "backward", "columns", "rows", "back_columns", "back_rows",
-    "kind",
-)  # fmt: skip
+_INTEGERS = ("first", "place", "count", "weights", "columns", "rows", "kind")
 _FLOATS = (
     "parameter", "max_slope", "spectral", "frobenius", "forward_error", "backward_error",
     "own_error", "output_norm",
@@ -161,11 +155,12 @@ def _blocks(matrix: FloatArray, rows: int, columns: int) -> FloatArray:
 @dataclass
 class _Contents:
     """The contents of the tables of networks (`LayerTables`), of which lists are filled network by
-    network. packets, neurons: how many there are."""
+    network. dtype: of weights. packets, neurons: how many there are."""
 
+    dtype: type[np.float32 | np.float64]
     integers: list[int]
     floats: list[float]
-    blocks: list[FloatArray]
+    blocks: list[npt.NDArray[Any]]
     records: list[FloatArray]
     outputs: list[float]
     packets: int = 0
@@ -175,10 +170,11 @@ class _Contents:
 
     @classmethod
     def of_networks(
-        cls, networks: Sequence[SmallNetwork], kinds: tuple[Activation, ...], unit: float
+        cls, networks: Sequence[SmallNetwork], kinds: tuple[Activation, ...], backend: Backend
     ) -> _Contents:
-        """The contents for all networks. unit: the unit roundoff."""
-        contents = cls([], [], [], [], [])
+        """The contents for all networks."""
+        unit = 0.5 * backend.machine_epsilon
+        contents = cls(backend.dtype, [], [], [], [], [])
         types = [type(kind) for kind in kinds]
         for network in networks:
             place, before = 0, _COLUMNS
@@ -197,21 +193,20 @@ class _Contents:
         before: the number of values of the layer before, with padding.
         """
         weights, number = layer.weights, len(layer.bias)
-        count, back_rows = _padded(number, ROWS), _padded(before, ROWS)
-        pieces = _blocks(weights, count, before), _blocks(weights.T, back_rows, count)
-        sizes = [len(piece) // PACKET for piece in pieces]
+        count = _padded(number, ROWS)
         self.integers += [
-            self.neurons, place, count, self.packets, self.packets + sizes[0],
-            before // _COLUMNS, count // ROWS, count // _COLUMNS, back_rows // ROWS, kind,
+            self.neurons, place, count, self.packets, before // _COLUMNS, count // ROWS, kind,
         ]  # fmt: skip
         # Rounded up, also to single precision.
         up = 1 + 4 * unit
         activation = layer.activation
+        max_slope = activation.max_slope
+        if layer.linear_count:
+            max_slope = max(1.0, max_slope)
         self.floats += [
-            activation.parameter, max(1.0, activation.max_slope) * up
-            if layer.linear_count else activation.max_slope, layer.spectral * up,
-            float(np.linalg.norm(weights)) * (1 + 1e-9) * up,
-            _sum_error(before) * unit * up, _sum_error(count) * unit * up, layer.own_error * up,
+            activation.parameter, max_slope, layer.spectral * up,
+            float(np.linalg.norm(weights)) * (1 + 1e-9) * up, _sum_error(before) * unit * up,
+            _back_sum_error(count) * unit * up, layer.own_error * up,
             float(np.linalg.norm(layer.outputs)) * _NORM_FACTOR,
         ]  # fmt: skip
         record = np.zeros((count, PACKET))
@@ -220,8 +215,8 @@ class _Contents:
         record[:number, 2] = layer.outputs
         record[: layer.linear_count, 3] = 1
         self.records.append(record)
-        self.blocks += pieces
-        self.packets += sum(sizes)
+        self.blocks.append(_blocks(weights, count, before).astype(self.dtype))
+        self.packets += count * before // PACKET
         self.neurons += count
         self.width = max(self.width, count)
         return count
@@ -240,7 +235,7 @@ class LayerTables:
 
     layer_count: the number of layers with activations.
     integers, floats: the numbers of layers (`LayerNumbers`).
-    weights: the blocks of all matrices and of their transposes.
+    weights: the blocks of all matrices.
     neurons: a record for each neuron: its bias, the norm of its row of W, its weight in the output,
         and 1 if it is linear, else 0.
     outputs: for each network the number that is added to its output, and a bound of its error.
@@ -274,7 +269,7 @@ class LayerTables:
         """Upload networks. Lanes have the first one (`of_network`)."""
         layers = [layer for network in networks for layer in network.layers]
         kinds = tuple({type(layer.activation): layer.activation for layer in layers}.values())
-        contents = _Contents.of_networks(networks, kinds, 0.5 * backend.machine_epsilon)
+        contents = _Contents.of_networks(networks, kinds, backend)
         return cls(
             backend,
             dr.opaque(backend.UInt32, len(networks[0].layers)),
@@ -363,6 +358,48 @@ class LayerTables:
         _, inputs, outputs = loop((u(0), inputs, outputs), lambda s: s[0] < rows, row_step, "rows")
         return inputs, outputs
 
+    def multiply_back(self, inputs: Any, outputs: Any, layer: LayerNumbers) -> tuple[Any, Any]:
+        """Multiply a vector in local memory by the transpose of a layer's matrix. Returns the
+        changed `inputs` and `outputs`.
+
+        Each block of rows adds sums of `ROWS` products, each by chains of four fused multiply-adds,
+        to all entries (`_back_sum_error`).
+        """
+        u, zero = self.backend.UInt32, self.backend.Float(0)
+
+        def clear(state: Any) -> Any:
+            """Set an entry to zero."""
+            i, outputs = state
+            outputs[i] = zero
+            return i + 1, outputs
+
+        def column_step(state: Any) -> Any:
+            """Add the sums of four columns."""
+            i, row, y, outputs = state
+            for c in range(_COLUMNS):
+                column = i * _COLUMNS + c
+                at = layer.weights + (row * (layer.columns * _COLUMNS) + column) * (ROWS // PACKET)
+                weights = self._packet(at) + self._packet(at + 1)
+                parts = [weights[k] * y[k] for k in range(4)]
+                for k in range(4, ROWS):
+                    parts[k % 4] = dr.fma(weights[k], y[k], parts[k % 4])
+                outputs[column] += (parts[0] + parts[1]) + (parts[2] + parts[3])
+            return i + 1, row, y, outputs
+
+        def row_step(state: Any) -> Any:
+            """Add a block of rows."""
+            row, inputs, outputs = state
+            y = [inputs[row * ROWS + k] for k in range(ROWS)]
+            start = (u(0), row, y, outputs)
+            _, _, _, outputs = loop(start, lambda s: s[0] < layer.columns, column_step, "columns")
+            return row + 1, inputs, outputs
+
+        count = layer.columns * _COLUMNS
+        _, outputs = loop((u(0), outputs), lambda s: s[0] < count, clear, "clear")
+        start = (u(0), inputs, outputs)
+        _, inputs, outputs = loop(start, lambda s: s[0] < layer.rows, row_step, "rows back")
+        return inputs, outputs
+
     def _packet(self, index: Index) -> list[Real]:
         """Eight weights."""
         packet = dr.gather(self.backend.ArrayXf, self.weights, index, shape=(PACKET, 1))
@@ -373,6 +410,11 @@ def _sum_error(columns: int) -> float:
     """A bound, in units of u, of the relative rounding error of a row's sum and of two further
     operations, of weights rounded to single precision, and of terms of second order."""
     return 1.001 * (_COLUMNS + columns // _COLUMNS + 4)
+
+
+def _back_sum_error(rows: int) -> float:
+    """The same bound for sums over rows (`LayerTables.multiply_back`)."""
+    return 1.001 * (ROWS // 4 + 2 + rows // ROWS + 4)
 
 
 def loop(

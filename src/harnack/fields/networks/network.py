@@ -60,11 +60,10 @@ _COARSE_CELLS, _CELLS = 8, 32
 _MIN_RAYS = 2048
 # The numbers of fine cells across for ReLU networks of at most so many weights, whose ranges are
 # computed by products of matrices, and for others, which are sampled.
-_CELLS_OF_RELU = ((300_000, _CELLS), (2_000_000, 16))
+_CELLS_OF_RELU = ((20_000, 24), (300_000, _CELLS), (2_000_000, 16))
 _CELLS_OF_OTHERS = ((20_000, _CELLS),)
-# The largest number of weights of all small networks of cells: 128 MB in single precision, with
-# transposes.
-_MAX_CELL_WEIGHTS = 1 << 24
+# The largest number of weights of all small networks of cells: 128 MB in single precision.
+_MAX_CELL_WEIGHTS = 1 << 25
 # Lengths on rays are taken between these: beyond are only rays without an end.
 _SHORTEST, _LONGEST = 1e-30, 1e15
 
@@ -295,8 +294,8 @@ class Network(Field):
 
         def is_empty(boxes: BoxCells, margin: float) -> BoolArray:
             room = margin * boxes.size
-            reaches = (boxes.corners - room <= upper).all(axis=1)
-            reaches &= (boxes.corners + boxes.size + room >= lower).all(axis=1)
+            is_apart = (boxes.corners - room > upper) | (boxes.corners + boxes.size + room < lower)
+            reaches: BoolArray = ~np.any(is_apart, axis=1)
             ranges = ranges_in_boxes(self.layers, boxes.subset(reaches), margin)
             found = np.ones(len(boxes.corners), np.bool_)
             # NaN proves nothing.
