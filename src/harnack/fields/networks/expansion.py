@@ -41,6 +41,11 @@ kink, |k| e, plus the error of computing a. Only the terms that are new at a neu
 with |A|: the error of f is not the product of the norms of all layers. E itself grows as P does.
 The computed A and tangents have errors whose norms are bounded in the same way.
 
+A small network (`cell_networks`) stands for a larger one. Its z differ from those of the larger one
+by numbers whose bound is a part of their own errors, and its output by at most `output_error`,
+which is a part of `value_error`. The bounds of changes are about the small network. So f(s) of the
+larger one lies within value -+ value_error plus the change, as the step's proof needs.
+
 The idea to follow a network's range along a ray is from Sharp and Jacobson, Spelunking the Deep
 (2022), by affine arithmetic; weighting relaxations of neurons by a pass backwards is from the
 verification of networks (Zhang et al., CROWN, 2018).
