@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from harnack.fields.networks.box_ranges import ranges_in_boxes, with_rows
+from harnack.fields.networks.box_ranges import BoxRanges, ranges_in_boxes, with_rows
 from harnack.fields.networks.layer_tables import (
     INPUTS,
     ROWS,
@@ -47,28 +47,29 @@ __all__ = ["networks_of_cells"]
 Layer: TypeAlias = "tuple[FloatArray, FloatArray]"
 
 _UNIT = 2.0**-53
-# So many cells are treated at once.
+# In so many cells weights are counted first; and so many cells are treated at once.
+_SOME_CELLS = 100
 _CELLS_AT_ONCE = 384
 
 
 def networks_of_cells(
     layers: Sequence[Layer], activation: Activation, boxes: BoxCells, max_weights: int
 ) -> list[SmallNetwork] | None:
-    """For each box a network that equals a ReLU network in it; None if they had more weights than
-    `max_weights` in all.
+    """For each box a network that equals a ReLU network in it; None if they would have more
+    weights than about `max_weights` in all.
 
     layers: of the network. activation: the function ReLU.
     """
+    # Some of the cells tell whether all of them would have too many.
+    some = BoxCells(boxes.corners[:: 1 + len(boxes.corners) // _SOME_CELLS], boxes.size)
+    scale = len(boxes.corners) / max(1, len(some.corners))
+    if _weight_count(ranges_in_boxes(layers, some)) * scale > max_weights:
+        return None
     networks: list[SmallNetwork] = []
-    weights = 0
     norms = [spectral_bound(matrix) for matrix, _ in layers]
     for k in range(0, len(boxes.corners), _CELLS_AT_ONCE):
         part = BoxCells(boxes.corners[k : k + _CELLS_AT_ONCE], boxes.size)
         ranges = ranges_in_boxes(layers, part)
-        weights += _weight_count([~(a | d) for a, d in zip(ranges.is_active, ranges.is_dead,
-                                                           strict=True)])  # fmt: skip
-        if weights > max_weights:
-            return None
         values = _Values.of_boxes(part)
         found: list[list[NetworkLayer]] = [[] for _ in part.corners]
         for index, layer in enumerate(layers[:-1]):
@@ -82,8 +83,10 @@ def networks_of_cells(
     return networks
 
 
-def _weight_count(open_: Sequence[BoolArray]) -> int:
-    """The number of weights, with padding, of networks with these open neurons."""
+def _weight_count(ranges: BoxRanges) -> int:
+    """The number of weights, with padding, of the networks of boxes with these ranges."""
+    pairs = zip(ranges.is_active, ranges.is_dead, strict=True)
+    open_ = [~(is_active | is_dead) for is_active, is_dead in pairs]
     before, count = np.full(len(open_[0]), INPUTS), 0
     for index, mask in enumerate(open_):
         after = before + mask.sum(axis=1)
