@@ -91,7 +91,7 @@ def test_samples_in_cells_are_right_in_their_balls(precision: Any) -> None:
     layers, rng = random_layers(3), np.random.default_rng(4)
     field, backend = hk.Network(layers), choose_backend(precision)
     evaluator: Any = field.evaluator(backend, Plan((0.0,), 10_000))
-    grid = field.cells((0.0,), cast("int", field.fine_cells))
+    grid = evaluator.occupied_cells()
     centers = grid.occupied_centers()
     p = centers[rng.integers(len(centers), size=300)]
     p = p + grid.cell_size * rng.uniform(-0.499, 0.499, p.shape)

@@ -218,15 +218,15 @@ class Network(Field):
         return all(isinstance(entry, ReLU) for entry in self._activations)
 
     @property
-    def fine_cells(self) -> int | None:
+    def _fine_cells(self) -> int | None:
         """The number of fine cells across the domain for many rays; None for no such cells."""
         choices = _CELLS_OF_RELU if self._is_relu else _CELLS_OF_OTHERS
         return next((cells for most, cells in choices if self.weight_count <= most), None)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         has_cells = bool(plan.levels) and plan.ray_count >= _MIN_RAYS and self._is_relu
-        levels = plan.levels if has_cells and self.fine_cells is not None else ()
-        return _NetworkEvaluator(self, plan, *self._upload(backend, levels))
+        levels = plan.levels if has_cells and self._fine_cells is not None else ()
+        return _NetworkEvaluator(self, plan, self._fine_cells, *self._upload(backend, levels))
 
     @cached_upload
     def _upload(
@@ -241,8 +241,8 @@ class Network(Field):
         lower, upper = self.domain.bounds()
         networks = [SmallNetwork.of_layers(self.layers, self._activations)]
         grid = None
-        if levels and self.fine_cells is not None:
-            cells = self.cells(levels, self.fine_cells)
+        if levels and self._fine_cells is not None:
+            cells = self.cells(levels, self._fine_cells)
             small = networks_of_cells(
                 self.layers, self._activations[0], cells.occupied_boxes(), _MAX_CELL_WEIGHTS
             )
@@ -278,7 +278,7 @@ class Network(Field):
         assert self.domain is not None
         grids, domain = _GRIDS.get(self, levels, dict), self.domain
         if across not in grids:
-            if self._is_relu and self.fine_cells is not None:
+            if self._is_relu and self._fine_cells is not None:
                 grids[across] = OccupancyGrid.from_test(
                     *domain.bounds(), self._emptiness_test(levels), across
                 )
@@ -403,6 +403,7 @@ class _NetworkEvaluator(Evaluator):
 
     field: the network.
     plan: what it is used for.
+    fine_cells: the number of fine cells across the domain for many rays; None for no such cells.
     tables: the weights.
     lipschitz: a Lipschitz constant of f everywhere.
     size: the diagonal of the domain.
@@ -411,6 +412,7 @@ class _NetworkEvaluator(Evaluator):
 
     field: Network
     plan: Plan
+    fine_cells: int | None
     tables: LayerTables
     lipschitz: Real
     size: Real
@@ -465,7 +467,7 @@ class _NetworkEvaluator(Evaluator):
         return bounds[0].gradient_change
 
     def occupied_cells(self) -> OccupancyGrid | None:
-        cells = self.field.fine_cells
+        cells = self.fine_cells
         if cells is None or not self.plan.levels or self.plan.ray_count < _MIN_RAYS:
             return None
         return self.field.cells(self.plan.levels, cells)
