@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "BoxCells",
     "Clearance",
+    "EmptinessTest",
     "EmptySpaceGrid",
     "GridCell",
     "GridData",
@@ -47,6 +48,7 @@ __all__ = [
     "largest_connected_component",
     "merge_kdops",
     "nonempty_cells",
+    "refine_by_test",
     "refine_cells",
     "round_to_short_float",
 ]
@@ -54,6 +56,10 @@ __all__ = [
 Clearance: TypeAlias = Callable[[FloatArray], FloatArray]
 """A function from points (n, 3) to lengths (n,), which are proved lower bounds of the distances of
 the points from a set, such as a level set."""
+
+EmptinessTest: TypeAlias = "Callable[[BoxCells, float], BoolArray]"
+"""A function from boxes and a margin to a mask (n,): whether each box, enlarged on all sides by the
+margin times its size, is proved to hold no point of a set, such as a level set."""
 
 _OCTANTS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 
@@ -172,14 +178,29 @@ def refine_cells(
     margin: a cell counts as empty only if it is proved empty after it was enlarged on all sides by
         this fraction of its size.
     """
+
+    def is_empty(cells: BoxCells, margin: float) -> BoolArray:
+        return cells.is_proved_empty(clearance, margin)
+
+    return refine_by_test(cells, is_empty, max_cells_per_round, max_rounds, margin)
+
+
+def refine_by_test(
+    cells: BoxCells,
+    is_empty: EmptinessTest,
+    max_cells_per_round: int,
+    max_rounds: int,
+    margin: float = 0.0,
+) -> RefinedCells:
+    """Split cells as `refine_cells` does, by a test of boxes in place of a clearance."""
     empty: list[BoxCells] = []
     for _ in range(max_rounds):
         if 8 * len(cells.corners) > max_cells_per_round:
             break
         split = cells.octants()
-        is_empty = split.is_proved_empty(clearance, margin)
-        cells = split.subset(~is_empty)
-        empty.append(split.subset(is_empty))
+        which = is_empty(split, margin)
+        cells = split.subset(~which)
+        empty.append(split.subset(which))
     return RefinedCells(cells, tuple(empty))
 
 
@@ -265,6 +286,11 @@ class EmptySpaceGrid:
             vector(layout.shape),
             upload_integers(backend, layout.empty_distance),
         )
+
+    @property
+    def usable_margin(self) -> float:
+        """`margin` without the part that is reserved for the rounding of positions."""
+        return self.margin - _ROUNDING_SHARE
 
     def cell(self, p: Vec3) -> GridCell:
         """The cell in which p lies or, if p is outside of the grid, the nearest cell."""
@@ -375,7 +401,7 @@ class GridCell:
         """
         # self.corner: the lower corner of the point's cell.
         length: Real = self.grid.backend.Float(dr.inf)
-        margin = self.grid.margin - _ROUNDING_SHARE
+        margin = self.grid.usable_margin
         for k in range(3):
             # The planes of the cube across this axis; the path leaves through one of them.
             upper, lower = self.corner[k] + reach, self.corner[k] + 1 - reach
@@ -453,6 +479,18 @@ class OccupancyGrid(GridData):
 
         lower, upper: the corners (3,) of the box.
         clearance: gives proved lower bounds of the distances of points from the set.
+        """
+
+        def is_empty(cells: BoxCells, margin: float) -> BoolArray:
+            return cells.is_proved_empty(clearance, margin)
+
+        return cls.from_test(lower, upper, is_empty, across)
+
+    @classmethod
+    def from_test(
+        cls, lower: FloatArray, upper: FloatArray, is_empty: EmptinessTest, across: int
+    ) -> OccupancyGrid:
+        """Build a grid as `from_clearance` does, by a test of boxes.
 
         There are no points of the set outside of the box, so an empty cell at a face of the box
         stays empty if it is extended outwards. Cells are never smaller than the spacing of the
@@ -472,19 +510,25 @@ class OccupancyGrid(GridData):
         roots = BoxCells(origin + side * indices, np.full(3, side))
         # Margins are fractions of a cube: those of large cubes are larger than needed, never
         # smaller.
-        roots = roots.subset(~roots.is_proved_empty(clearance, _MARGIN))
+        roots = roots.subset(~is_empty(roots, _MARGIN))
         # The largest integer: no limit of the number of cells.
-        cells = refine_cells(roots, clearance, np.iinfo(np.int64).max, _ROUNDS, _MARGIN).occupied
+        most = int(np.iinfo(np.int64).max)
+        cells = refine_by_test(roots, is_empty, most, _ROUNDS, _MARGIN).occupied
         nx, ny, nz = (count << _ROUNDS for count in (nx, ny, nz))
-        is_empty = np.ones((nz, ny, nx), np.bool_)
+        mask = np.ones((nz, ny, nx), np.bool_)
         x, y, z = np.round((cells.corners - origin) / cell).astype(np.int64).T
-        is_empty[z, y, x] = False
-        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(is_empty))
+        mask[z, y, x] = False
+        return cls(origin, cell, (nx, ny, nz), distance_to_occupied(mask))
 
     @classmethod
     def empty(cls) -> OccupancyGrid:
         """The grid of a set without points: a single cell, which is empty."""
         return cls(np.zeros(3), 1.0, (1, 1, 1), distance_to_occupied(np.ones((1, 1, 1), np.bool_)))
+
+    def occupied_boxes(self) -> BoxCells:
+        """The cells that are not empty, with their margins, in the order of their indices."""
+        size = np.full(3, self.cell_size * (1 + 2 * _MARGIN))
+        return BoxCells(self.occupied_centers() - 0.5 * size, size)
 
     def occupied_centers(self) -> FloatArray:
         """The centers (n, 3) of the cells that are not empty."""

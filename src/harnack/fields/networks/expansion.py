@@ -41,6 +41,11 @@ kink, |k| e, plus the error of computing a. Only the terms that are new at a neu
 with |A|: the error of f is not the product of the norms of all layers. E itself grows as P does.
 The computed A and tangents have errors whose norms are bounded in the same way.
 
+A small network (`cell_networks`) stands for a larger one. Its z differ from those of the larger one
+by numbers whose bound is a part of their own errors, and its output by at most `output_error`,
+which is a part of `value_error`. The bounds of changes are about the small network. So f(s) of the
+larger one lies within value -+ value_error plus the change, as the step's proof needs.
+
 The idea to follow a network's range along a ray is from Sharp and Jacobson, Spelunking the Deep
 (2022), by affine arithmetic; weighting relaxations of neurons by a pass backwards is from the
 verification of networks (Zhang et al., CROWN, 2018).
@@ -211,7 +216,7 @@ class _Forward:
         )
         return cls(
             tables, [real(length) for length in lengths], direction, state,
-            _Memory(x, z, kept), [zero, zero], zero,
+            _Memory(x, z, kept), [zero, zero, zero], zero,
         )  # fmt: skip
 
     def run(self) -> _Forward:
@@ -249,7 +254,7 @@ class _Forward:
         x, z = tables.multiply(
             self.memory.x,
             self.memory.z,
-            layer.forward,
+            layer.weights,
             layer.columns,
             layer.rows,
             len(self.lengths),
@@ -269,7 +274,7 @@ class _Forward:
                 vector[j] = neuron.point.slope * tangent
             for vector, spread in zip(x[-n:], neuron.spreads(layer), strict=True):
                 vector[j] = spread
-            at = layer.first + j
+            at = layer.place + j
             added = neuron.added()
             for vector, number in zip(kept, neuron.kept(), strict=True):
                 vector[at] = number
@@ -318,47 +323,44 @@ class _Forward:
         # The sums over neurons: value error, gradient error, slope error, and for each length.
         per_length = 1 if self.direction is None else 6
         sums = [zero] * (3 + per_length * len(lengths))
-        last = tables.layer(tables.layer_count - 1)
+        x = self.memory.x[:1]
 
-        def set_output(state: Any) -> Any:
-            """Start with the weights of the output."""
+        def clear(state: Any) -> Any:
+            """Start with zeros: the output adds its weights of a layer when that is reached."""
             j, x = state
-            x[0][j] = tables.neurons.read_record(last.first + j)[2] + zero
+            x[0][j] = zero
             return j + 1, x
 
-        x = self.memory.x[:1]
-        _, x = loop((u(0), x), lambda s: s[0] < last.count, set_output, "output")
-        error = zero + unit * tables.output_norm
+        last = tables.layer(tables.layer_count - 1)
+        _, x = loop((u(0 * zero), x), lambda s: s[0] < last.count, clear, "output")
 
         def layer_step(state: Any) -> Any:
             """Go back over a layer."""
             index, x, z, kept, sums, error = state
             layer = tables.layer(index - 1)
+            # The weights of the output are rounded.
+            error = dr.fma(unit, layer.output_norm, error)
 
             def step(inner: Any) -> Any:
                 """Add the remainders of a neuron."""
                 j, x, z, kept, sums, norms = inner
-                a, at = x[0][j], layer.first + j
+                at = layer.place + j
+                a = x[0][j] + tables.neurons.read_record(layer.first + j)[2]
                 numbers = [vector[at] for vector in kept]
                 m = numbers[0]
                 z[0][j] = m * a
-                sums = self._summed(sums, numbers, a, error)
-                return (
-                    j + 1,
-                    x,
-                    z,
-                    kept,
-                    sums,
-                    [dr.fma(m * a, m * a, norms[0]), fmax(norms[1], dr.abs(m))],
-                )
+                sums = self._summed(sums, numbers, a, dr.fma(2 * unit, dr.abs(a), error))
+                squares = [dr.fma(m * a, m * a, norms[0]), dr.fma(a, a, norms[1])]
+                return j + 1, x, z, kept, sums, [*squares, fmax(norms[2], dr.abs(m))]
 
             _, x, z, kept, sums, norms = loop(
-                (u(0), x, z, kept, sums, [zero, zero]), lambda s: s[0] < layer.count, step, "back"
+                (u(0), x, z, kept, sums, [zero] * 3), lambda s: s[0] < layer.count, step, "back"
             )
-            z, x = tables.multiply(z, x, layer.backward, layer.back_columns, layer.back_rows)
+            error = dr.fma(2 * unit * _ROUND_UP, dr.sqrt(norms[1]), error)
+            z[0], x[0] = tables.multiply_back(z[0], x[0], layer)
             norm = dr.sqrt(norms[0]) * _ROUND_UP
             own = (layer.backward_error * layer.frobenius + 2 * unit * layer.spectral) * norm
-            error = dr.fma(norms[1] * layer.spectral * _ROUND_UP, error, own * _ROUND_UP)
+            error = dr.fma(norms[2] * layer.spectral * _ROUND_UP, error, own * _ROUND_UP)
             return index - 1, x, z, kept, sums, error
 
         start = (
@@ -367,7 +369,7 @@ class _Forward:
             self.memory.z[:1],
             self.memory.kept,
             sums,
-            error,
+            zero,
         )
         _, x, _, _, sums, error = loop(start, lambda s: s[0] > 0, layer_step, "layers back")
         gradient = type(p)(*(x[0][u(k)] for k in range(INPUTS)))
@@ -398,13 +400,14 @@ class _Forward:
     def _result(self, gradient: Vec3, sums: list[Real], error: Real) -> Expansion:
         """The expansion. sums: over all neurons. error: of the gradient, by rounding."""
         tables, unit = self.tables, self.tables.unit
-        value = self.output[0] + (self.output[1] + tables.output_bias)
+        bias, own_error = tables.output()
+        value = self.output[0] + (self.output[1] + bias)
         # The sum of the output is compensated (Ogita, Rump and Oishi 2005, Dot2), and weights and
         # bias are rounded.
-        size = tables.output_norm * self.state.norm
-        value_error = sums[0] * _ROUND_UP + unit * (
-            3 * size + 4 * dr.abs(tables.output_bias) + 2 * dr.abs(value)
-        )
+        size = self.output[2] * _ROUND_UP
+        value_error = sums[0] * _ROUND_UP + unit * (3 * size + 4 * dr.abs(bias) + 2 * dr.abs(value))
+        value_error = value_error + own_error * _ROUND_UP
+        error = error + own_error * _ROUND_UP
         slope_error = sums[2] * _ROUND_UP + error + 4 * unit * dr.norm(gradient)
         bounds: list[Any] = []
         for k, length in enumerate(self.lengths):
@@ -456,19 +459,19 @@ class _Neuron:
     def at(cls, forward: _Forward, layer: LayerNumbers, j: Index, z: list[Any]) -> _Neuron:
         """Neuron j of a layer. z: products with its row, in local memory."""
         tables, before = forward.tables, forward.state
-        bias, norm, output_weight = tables.neurons.read_record(layer.first + j)[:3]
+        bias, norm, output_weight, linear = tables.neurons.read_record(layer.first + j)[:4]
         number = z[0][j] + bias
         tangents = [vector[j] for vector in z[1 : len(z) - len(forward.lengths)]]
         rows = layer.forward_error * _ROUND_UP
         smallest = float(dr.smallest(tables.backend.Float)) * 4096
-        own = dr.fma(rows, dr.fma(norm, before.norm, dr.abs(bias)), smallest)
+        own = dr.fma(rows, dr.fma(norm, before.norm, dr.abs(bias)), smallest + layer.own_error)
         error = dr.fma(norm, before.error, own) * _ROUND_UP
         tangent_error = dr.fma(norm, before.tangent_error, rows * norm * before.tangent_norm)
         squares = tangents[0] * tangents[0]
         for tangent in tangents[1:]:
             squares = dr.fma(tangent, tangent, squares)
         size = (dr.sqrt(squares) + tangent_error) * _ROUND_UP
-        point, kink = _activate(tables, layer, number)
+        point, kink = _activate(tables, layer, number, linear != 0)
         second = _largest(_second_range(tables, layer, number, error, error))
         is_hidden = (kink != 0) & (dr.abs(number) <= error)
         wrong = dr.fma(second, error, point.slope_error)
@@ -527,14 +530,15 @@ class _Neuron:
 
     def add_to(self, output: list[Real]) -> list[Real]:
         """The output, to which the neuron's value with its weight is added: the sum of two numbers,
-        of which the second collects the rounding errors of the first."""
-        high, low = output
+        of which the second collects the rounding errors of the first; and the sum of all absolute
+        values."""
+        high, low, size = output
         product = self.output_weight * self.point.value
         rest = dr.fma(self.output_weight, self.point.value, -product)
         total = high + product
         part = total - high
         lost = (high - (total - part)) + (product - part)
-        return [total, low + (lost + rest)]
+        return [total, low + (lost + rest), size + dr.abs(product)]
 
 
 @dataclass(frozen=True)
@@ -635,8 +639,10 @@ def _largest(ends: tuple[Real, Real]) -> Real:
     return fmax(dr.abs(ends[0]), dr.abs(ends[1]))
 
 
-def _activate(tables: LayerTables, layer: LayerNumbers, z: Real) -> tuple[ActivationPoint, Real]:
-    """The activation function of a layer at z, and its kink."""
+def _activate(
+    tables: LayerTables, layer: LayerNumbers, z: Real, is_linear: Mask
+) -> tuple[ActivationPoint, Real]:
+    """The activation function of a layer at z, and its kink. is_linear: mask of linear neurons."""
     point, kink = None, None
     for index, kind in enumerate(tables.activations):
         other = kind.at(z, layer.parameter)
@@ -649,6 +655,10 @@ def _activate(tables: LayerTables, layer: LayerNumbers, z: Real) -> tuple[Activa
         numbers = [dr.select(is_kind, getattr(other, k), getattr(point, k)) for k in names]
         point, kink = type(point)(*numbers), dr.select(is_kind, other_kink, kink)
     assert point is not None
+    if tables.has_linear:  # only ReLUs are beside linear ones: no other numbers change
+        number, slope = dr.select(is_linear, z, point.value), dr.select(is_linear, 1, point.slope)
+        point = dataclasses.replace(point, value=number, slope=slope)
+        kink = dr.select(is_linear, 0, kink)
     return point, kink
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.elementary import clamp, safe_norm
+from harnack.backend.elementary import clamp, fmin, safe_norm
 from harnack.backend.validation import as_real_array, make_read_only
 from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.parabola import ParabolaEnclosure
@@ -21,19 +21,29 @@ from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.clearance import occupied_cells
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
-from harnack.fields.networks.activations import Activation, activation_of
+from harnack.fields.networks.activations import Activation, ReLU, activation_of
+from harnack.fields.networks.box_ranges import ranges_in_boxes
+from harnack.fields.networks.cell_networks import networks_of_cells
 from harnack.fields.networks.expansion import BallBound, Expansion, RayBound, expand
-from harnack.fields.networks.layer_tables import INPUTS, MAX_WIDTH, LayerTables, spectral_bound
+from harnack.fields.networks.layer_tables import (
+    INPUTS,
+    MAX_WIDTH,
+    LayerTables,
+    SmallNetwork,
+    spectral_bound,
+)
+from harnack.fields.networks.network_grid import NetworkGrid
 from harnack.fields.networks.torch_modules import layers_of_modules
 from harnack.geometry.clip_volumes import Box
+from harnack.tree.empty_space import OccupancyGrid
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.backend import Backend, BoolArray, FloatArray, Real, Vec3
     from harnack.enclosures.samples import Ray
     from harnack.geometry.volume import Volume
-    from harnack.tree.empty_space import OccupancyGrid
+    from harnack.tree.empty_space import BoxCells, EmptinessTest
 
 __all__ = ["Network"]
 
@@ -46,8 +56,14 @@ _RADII = (0.25, 0.07, 2.0**-6, 2.0**-8)
 # asks for a length of so many proved steps. By experiment, as the numbers of cells.
 _SHORTER, _REACH_GROWTH = 0.25, 4.0
 _COARSE_CELLS, _CELLS = 8, 32
-# For fewer rays than this, or for more weights, no fine cells are made.
-_MIN_RAYS, _MAX_WEIGHTS = 2048, 20_000
+# For fewer rays than this no fine cells are made.
+_MIN_RAYS = 2048
+# The numbers of fine cells across for ReLU networks of at most so many weights, whose ranges are
+# computed by products of matrices, and for others, which are sampled.
+_CELLS_OF_RELU = ((20_000, 24), (300_000, _CELLS), (2_000_000, 16))
+_CELLS_OF_OTHERS = ((20_000, _CELLS),)
+# The largest number of weights of all small networks of cells: 128 MB in single precision.
+_MAX_CELL_WEIGHTS = 1 << 25
 # Lengths on rays are taken between these: beyond are only rays without an end.
 _SHORTEST, _LONGEST = 1e-30, 1e15
 
@@ -196,18 +212,48 @@ class Network(Field):
         """The number of weights and biases."""
         return sum(weights.size + bias.size for weights, bias in self.layers)
 
+    @property
+    def _is_relu(self) -> bool:
+        """Whether all activations are ReLUs."""
+        return all(isinstance(entry, ReLU) for entry in self._activations)
+
+    @property
+    def _fine_cells(self) -> int | None:
+        """The number of fine cells across the domain for many rays; None for no such cells."""
+        choices = _CELLS_OF_RELU if self._is_relu else _CELLS_OF_OTHERS
+        return next((cells for most, cells in choices if self.weight_count <= most), None)
+
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        return _NetworkEvaluator(self, plan, *self._upload(backend))
+        has_cells = bool(plan.levels) and plan.ray_count >= _MIN_RAYS and self._is_relu
+        levels = plan.levels if has_cells and self._fine_cells is not None else ()
+        return _NetworkEvaluator(self, plan, self._fine_cells, *self._upload(backend, levels))
 
     @cached_upload
-    def _upload(self, backend: Backend) -> tuple[LayerTables, Real, Real]:
-        """The tables on a backend; the Lipschitz constant; and the diagonal of the domain."""
+    def _upload(
+        self, backend: Backend, levels: tuple[float, ...]
+    ) -> tuple[LayerTables, Real, Real, NetworkGrid | None]:
+        """The tables on a backend; the Lipschitz constant; the diagonal of the domain; and which
+        cells have small networks.
+
+        levels: those for which cells have networks; () for none.
+        """
         assert self.domain is not None
         lower, upper = self.domain.bounds()
+        networks = [SmallNetwork.of_layers(self.layers, self._activations)]
+        grid = None
+        if levels and self._fine_cells is not None:
+            cells = self.cells(levels, self._fine_cells)
+            small = networks_of_cells(
+                self.layers, self._activations[0], cells.occupied_boxes(), _MAX_CELL_WEIGHTS
+            )
+            if small is not None:
+                networks += small
+                grid = NetworkGrid.upload(backend, cells)
         return (
-            LayerTables.upload(backend, self.layers, self._activations),
+            LayerTables.upload(backend, networks),
             dr.opaque(backend.Float, self.lipschitz * (1 + 1e-6)),
             dr.opaque(backend.Float, float(np.linalg.norm(upper - lower))),
+            grid,
         )
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
@@ -232,8 +278,33 @@ class Network(Field):
         assert self.domain is not None
         grids, domain = _GRIDS.get(self, levels, dict), self.domain
         if across not in grids:
-            grids[across] = occupied_cells(self, levels, domain, across)
+            if self._is_relu and self._fine_cells is not None:
+                grids[across] = OccupancyGrid.from_test(
+                    *domain.bounds(), self._emptiness_test(levels), across
+                )
+            else:
+                grids[across] = occupied_cells(self, levels, domain, across)
         return grids[across]
+
+    def _emptiness_test(self, levels: tuple[float, ...]) -> EmptinessTest:
+        """A test of boxes: whether a ReLU network takes none of the levels in them, or they lie
+        outside of the domain's box."""
+        assert self.domain is not None
+        lower, upper = self.domain.bounds()
+
+        def is_empty(boxes: BoxCells, margin: float) -> BoolArray:
+            room = margin * boxes.size
+            is_apart = (boxes.corners - room > upper) | (boxes.corners + boxes.size + room < lower)
+            reaches: BoolArray = ~np.any(is_apart, axis=1)
+            ranges = ranges_in_boxes(self.layers, boxes.subset(reaches), margin)
+            found = np.ones(len(boxes.corners), np.bool_)
+            # NaN proves nothing.
+            found[reaches] = np.logical_and.reduce(
+                [(ranges.lower > level) | (ranges.upper < level) for level in levels]
+            )
+            return found
+
+        return is_empty
 
     def describe(self) -> dict[str, Any]:
         """The shape of the network as a dictionary for users."""
@@ -332,19 +403,32 @@ class _NetworkEvaluator(Evaluator):
 
     field: the network.
     plan: what it is used for.
+    fine_cells: the number of fine cells across the domain for many rays; None for no such cells.
     tables: the weights.
     lipschitz: a Lipschitz constant of f everywhere.
     size: the diagonal of the domain.
+    grid: the cells that have small networks; None for no such cells.
     """
 
     field: Network
     plan: Plan
+    fine_cells: int | None
     tables: LayerTables
     lipschitz: Real
     size: Real
+    grid: NetworkGrid | None
 
     def evaluate(self, p: Vec3) -> Sample:
-        expansion = expand(self.tables, p, [self.size * part for part in _RADII], None)
+        if self.grid is None:
+            return self._sample_in_balls(p, self.tables, dr.inf)
+        place = self.grid.place(p)
+        return self._sample_in_balls(p, self.tables.of_network(place.network), place.radius)
+
+    def _sample_in_balls(self, p: Vec3, tables: LayerTables, largest: Real) -> Sample:
+        """The sample with bounds in balls. tables: of the network that is right in the ball of the
+        radius `largest` around p."""
+        radii = [fmin(self.size * part, largest) for part in _RADII]
+        expansion = expand(tables, p, radii, None)
         norm = safe_norm(expansion.gradient) * (1 + 1e-5)
         bounds = cast("tuple[BallBound, ...]", expansion.bounds)
         balls = [Lipschitz(norm + bound.gradient_change, bound.radius) for bound in bounds]
@@ -352,13 +436,19 @@ class _NetworkEvaluator(Evaluator):
 
     def sample_ray(self, path: Ray, t: Real, ahead: Real, back: Real) -> RaySample:
         """The sample at the point of a ray with parameter t, with enclosures in front of it up to
-        the length `ahead` and up to a part of it. If the caller asks for other kinds of enclosures,
-        they follow from the sample at the point."""
-        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
-            return super().sample_ray(path, t, ahead, back)
+        the length `ahead` and up to a part of it; in a cell with a small network, up to where the
+        ray leaves the cell. If the caller asks for other kinds of enclosures, they follow from the
+        sample at the point, of the whole network, whose balls are larger than cells."""
         p = path.point(t)
+        if PiecewiseTaylorEnclosure not in path.proofs.kinds:
+            del ahead, back
+            return path.enclose(self._sample_in_balls(p, self.tables, dr.inf))
+        tables = self.tables
+        if self.grid is not None:
+            place = self.grid.place_on_ray(path, t, p)
+            tables, ahead = tables.of_network(place.network), fmin(ahead, place.radius)
         length = clamp(ahead, _SHORTEST, _LONGEST)
-        expansion = expand(self.tables, p, [length, _SHORTER * length], path.direction)
+        expansion = expand(tables, p, [length, _SHORTER * length], path.direction)
         slope = dr.dot(expansion.gradient, path.direction)
         rounding = 4 * self.tables.unit * safe_norm(expansion.gradient)
         around = SlopeRange.around(slope, expansion.linear_error + rounding)
@@ -372,14 +462,15 @@ class _NetworkEvaluator(Evaluator):
         return RaySample(sample, tuple(enclosures), (), slope, _REACH_GROWTH, expansion.slope_error)
 
     def gradient_change_bound(self, p: Vec3, radius: Real) -> Real:
+        # The whole network: a ball may be larger than a cell.
         bounds = cast("tuple[BallBound, ...]", expand(self.tables, p, [radius], None).bounds)
         return bounds[0].gradient_change
 
     def occupied_cells(self) -> OccupancyGrid | None:
-        is_large = self.field.weight_count > _MAX_WEIGHTS
-        if is_large or not self.plan.levels or self.plan.ray_count < _MIN_RAYS:
+        cells = self.fine_cells
+        if cells is None or not self.plan.levels or self.plan.ray_count < _MIN_RAYS:
             return None
-        return self.field.cells(self.plan.levels, _CELLS)
+        return self.field.cells(self.plan.levels, cells)
 
     def _everywhere(self, p: Vec3) -> Lipschitz:
         """The Lipschitz constant everywhere."""
