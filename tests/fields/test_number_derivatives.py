@@ -14,6 +14,7 @@ from drjit.llvm.ad import Array3f64, Float64, TensorXf64
 
 import harnack as hk
 from harnack.backend import choose_backend
+from tests.backend.test_kernels import compiled
 
 pytestmark = pytest.mark.skipif(choose_backend().name != "llvm", reason="types of the CPU")
 
@@ -186,3 +187,15 @@ def test_normals_by_weights_are_refused() -> None:
     hits = hk.trace(surface, Array3f64(0.3, 0.0, 3.0), Array3f64(0, 0, -1), level=0.1)
     with pytest.raises(Exception, match="normal of hits cannot be differentiated"):
         dr.backward(hits.normal.x)
+
+
+def test_other_numbers_compile_nothing() -> None:
+    def step(k: int) -> None:
+        radius, offset = Float64(0.5 + 0.01 * k), Array3f64(0.1 * k, 0.2, 0.0)
+        dr.enable_grad(radius, offset)
+        solid = hk.Sphere(radius) | hk.Cuboid((0.5, 0.5, 0.5)).translated(offset)
+        hits = hk.trace(solid, Array3f64([0.0, 0.1], 0.1, 3.0), Array3f64(0, 0, -1))
+        dr.backward(dr.sum(hits.t + hits.normal.x))
+
+    step(0), step(1)
+    assert compiled(lambda: (step(2), step(3))) == 0

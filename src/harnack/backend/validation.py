@@ -423,9 +423,11 @@ def as_triple(value: Any, name: str, *, all_positive: bool = False) -> tuple[flo
     Raises:
         TypeError, ValueError: they are not three such numbers.
     """
-    is_array = dr.is_array_v(cast("Any", type(value)))
+    kind = cast("Any", type(value))
+    # (The entries of a Dr.Jit vector one by one: together, a vector of literals would be a kernel.)
+    is_flat = dr.is_array_v(kind) and (dr.is_tensor_v(kind) or dr.depth_v(kind) == 1)
     try:
-        entries = tuple(np.array(dr.detach(value)).ravel() if is_array else value)
+        entries = tuple(np.array(dr.detach(value)).ravel() if is_flat else value)
     except TypeError:
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     if len(entries) != 3:

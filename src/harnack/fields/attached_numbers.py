@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
+import numpy as np
 
 from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
@@ -144,13 +145,24 @@ def attached_vector(value: Any, count: int, backend: Backend) -> tuple[Any, ...]
     """The numbers of a Dr.Jit vector, array or tensor, or of a tuple of numbers, as numbers of a
     backend, with their derivatives."""
     if isinstance(value, tuple | list):
-        entries = [attached_vector(entry, 1, backend)[0] if _has_array(entry)
-                   else backend.Float(entry) for entry in cast("Any", value)]  # fmt: skip
+        entries: list[Any] = [
+            attached_vector(entry, 1, backend)[0] if _has_array(entry) else backend.Float(entry)
+            for entry in cast("Any", value)
+        ]
         return tuple(entries)
     if dr.is_tensor_v(value):
         value = value.array
     if dr.depth_v(value) > 1:
-        return tuple(backend.Float(entry) for entry in value)
+        return tuple(_as_parameter(entry, backend) for entry in value)
     kind = cast("Any", type(value))
     index = dr.uint32_array_t(kind)
-    return tuple(backend.Float(dr.gather(kind, value, index(k))) for k in range(count))
+    return tuple(_as_parameter(dr.gather(kind, value, index(k)), backend) for k in range(count))
+
+
+def _as_parameter(number: Any, backend: Backend) -> Any:
+    """A number of a backend with the derivative of another one, whose value is a kernel parameter:
+    as a literal, each value would compile another kernel."""
+    with dr.suspend_grad():
+        plain = np.array(dr.detach(number), np.float64).ravel()
+        value = dr.opaque(backend.Float, float(plain[0]))
+    return dr.replace_grad(value, backend.Float(number))
