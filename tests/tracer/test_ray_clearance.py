@@ -57,7 +57,7 @@ def differences(e: Callable[[float], np.ndarray], step: float = 1e-4) -> np.ndar
 
 
 def agree(found: Any, expected: np.ndarray, rows: np.ndarray) -> None:
-    """Clearances of some rays have the derivatives of differences, and others that are finite 0."""
+    """Clearances of some rays have the derivatives of differences, and those of others 0."""
     found = np.array(found)
     scale = np.abs(expected[rows]).max()
     assert scale > 0
@@ -156,6 +156,10 @@ def test_what_is_refused_by_name() -> None:
     square = hk.PolygonMesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]], [[0, 1, 2, 3]])
     with pytest.raises(NotImplementedError, match=r"mesh\.face\(0\)"):
         hk.trace(square, *ray, clearance=True)
+    end = DOUBLE.Float(2.0)
+    dr.enable_grad(end)
+    with pytest.raises(NotImplementedError, match="a trace with clearance=True"):
+        hk.trace(SPHERE, vector(ray[0]), vector(ray[1]), t_max=end, clearance=True)
     with pytest.raises(AttributeError, match=r"'clearance': call trace\(\.\.\., clearance=True\)"):
         _ = hk.trace(SPHERE, *ray).clearance  # type: ignore[attr-defined]
 
@@ -250,6 +254,28 @@ def test_derivatives_by_parameters_include_those_of_the_gradient() -> None:
             )
         )
         agree(found[k], expected, misses)
+
+
+@pytest.mark.slow
+def test_derivatives_by_numbers_of_formulas_and_solids() -> None:
+    o, d = rays(40)
+
+    def drop(a: Any) -> hk.Field:
+        formula = lambda x, y, z, a: x * x + y * y + a * z * z - 0.3 * a * x * y * z - 0.6  # noqa: E731
+        return hk.expression(formula, a=a, domain=hk.Ball(radius=2.0))
+
+    def snowman(a: Any) -> hk.Field:
+        return hk.Sphere(a) | hk.Sphere(0.3).translated((0, 0, a))
+
+    for make in drop, snowman:
+        number = DOUBLE.Float(0.6)
+        dr.enable_grad(number)
+        dr.set_grad(number, 1)
+        hits = hk.trace(make(number), vector(o), vector(d), clearance=True)
+        expected = differences(lambda s, make=make: clearances(make(0.6 + s), o, d, 0.0))
+        away = ~np.array(hits.is_hit) & np.isfinite(expected)
+        assert away.sum() > 5
+        agree(dr.forward_to(hits.clearance), expected, away)
 
 
 def test_the_point_has_no_derivative() -> None:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 # Samples lie this fraction of the first-order distance apart, but at least one pitch, and at most
 # the third number of pitches. The pitch is the sampled length over the second number; on a ray
 # without an end, the size of its coordinates over the fourth number.
-_STEP_FRACTION, _PITCHES, _LONGEST_STEP, _PITCHES_OF_SIZE = 0.5, 64, 8, 32
+_STEP_FRACTION, _PITCHES, _LONGEST_STEP, _PITCHES_OF_SIZE = 0.25, 64, 4, 32
 # The largest number of samples (only rays without an end need that many), and of steps by which the
 # least e is then refined.
 _MAX_SAMPLES, _MAX_REFINEMENTS = 128, 48
@@ -60,8 +60,8 @@ def validate_clearance(surface: TracedSurface, options: TraceOptions) -> None:
     """Raise an error if the clearance of rays from this surface is not defined here.
 
     Raises:
-        ValueError: only the largest component is traced, since f has no smaller values beside it
-            than beside the others; or another device traces the rays.
+        ValueError: only the largest component is traced, as e is small beside the others, too; or
+            another device traces the rays.
         NotImplementedError: the field jumps at facets, or is a union of patches.
     """
     if options.backend is not None:
@@ -383,8 +383,7 @@ def attach_clearance_derivative(
     The clearance is the minimum of e over t. By the envelope theorem, its derivative is that of e
     at a fixed t, whether de/dt = 0 there or t is an end of the ray. (Where the ray enters or leaves
     the region in which levels count, t has the derivative of the ray parameter at which the ray
-    meets the tangent plane of that boundary.) With s the sign of f - level
-    and n = grad f/|grad f|,
+    meets the tangent plane of that boundary.) With s the sign of f - level and n = grad f/|grad f|,
 
         de = (s (df - dlevel) - e d|grad f|) / |grad f|,     d|grad f| = n . d(grad f).
     """
@@ -429,10 +428,10 @@ def _change_of_gradient_norm(
     inverse: 1/|grad f|; 0 where no derivative is attached.
 
     Formulas and solids give the derivative of their gradient. For other fields mixed derivatives
-    are not known, but those of values are: with n = grad f/|grad f|, n . grad f is the derivative of
-    f along n, which is taken here as (f(x + h n) - f(x - h n))/(2h) with constant n and h. With h =
-    u^(1/3) e, for a machine epsilon u, what differences leave out and what rounding does to them are
-    both about u^(2/3) of e d|grad f|.
+    are not known, but those of values are: with n = grad f/|grad f|, n . grad f is the derivative
+    of f along n, which is taken here as (f(x + h n) - f(x - h n))/(2h) with constant n and h. With
+    h = u^(1/3) e, for a machine epsilon u, what differences leave out and what rounding does to
+    them are both about u^(2/3) of e d|grad f|.
 
     Where a crease of such a field lies between x and x +- h n, |grad f| is held constant: the
     difference of the functions on both sides, over h, is no derivative.
@@ -445,7 +444,8 @@ def _change_of_gradient_norm(
     with dr.suspend_grad():
         h = fmax(e, _SMALLEST_LENGTH * max_norm(x))
         h = h * backend.machine_epsilon**_DIFFERENCE_EXPONENT
-        offset, weight = normal * h, 1 / (2 * h)
+        # (On other lanes, h may be 0.)
+        offset, weight = normal * h, dr.select((inverse > 0) & (h > 0), 0.5 / h, 0)
         gradients = tracer.sample(x - offset).gradient, tracer.sample(x + offset).gradient
         if tracer.field.traits.has_creases:
             change = fmax(*(max_norm(one - gradient) for one in gradients))
