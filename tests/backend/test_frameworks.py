@@ -289,7 +289,7 @@ def test_containers_and_other_arguments_are_passed_on() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["trace", "value"])
+@pytest.mark.parametrize("name", ["trace", "clearance", "value"])
 def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     """Vertices leave a plane, and then the convex position; batches begin anywhere in memory."""
     function, arrays = CASES[name]
