@@ -54,8 +54,13 @@ def depths_of_sum(first: Any, second: Any, constant: Any, origins: Any, directio
     return dr.select(hits.is_hit, hits.t, 0)
 
 
+def clearances(vertices: Any, origins: Any, directions: Any) -> Any:
+    return hk.trace(hk.SolidAngle(vertices), origins, directions, clearance=True).clearance
+
+
 CASES: dict[str, tuple[Any, list[Any]]] = {
     "trace": (depths, [LOOP, np.tile(EYE, (20, 1)), AWAY, np.array(6.0)]),
+    "clearance": (clearances, [LOOP, np.tile(EYE, (20, 1)), 3 * AWAY + 2 * EYE]),
     "value": (angles, [LOOP, POINTS]),
     "gradient": (slopes, [POINTS]),
     "weights": (
@@ -284,7 +289,7 @@ def test_containers_and_other_arguments_are_passed_on() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["trace", "value"])
+@pytest.mark.parametrize("name", ["trace", "clearance", "value"])
 def test_a_step_compiles_nothing_after_the_first_two(name: str) -> None:
     """Vertices leave a plane, and then the convex position; batches begin anywhere in memory."""
     function, arrays = CASES[name]
@@ -351,7 +356,7 @@ def test_code_of_the_page_runs(block: str, tmp_path: Path) -> None:
 
 
 def test_the_page_has_code() -> None:
-    assert len(PAGE) == 5
+    assert len(PAGE) == 6
 
 
 @pytest.mark.slow

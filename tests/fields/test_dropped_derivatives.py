@@ -164,7 +164,7 @@ FUNCTIONS = {
 SETTINGS = {
     "precision", "max_steps", "largest", "side", "require_crossing", "max_crossings", "enclosures",
     "method", "progress", "is_convex", "clip", "section", "backend", "options", "parameters",
-    "numbers",
+    "numbers", "clearance",
 }  # fmt: skip
 
 
@@ -222,6 +222,7 @@ PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
 NO_PARTS = {"Boundary", "NearestFacet", "PatchEntry", "VariableAccuracy", "JumpCrossing",
             "LevelGaps", "MarchResult", "Plan", "SurfaceTracer", "TraceOptions", "Traits",
             "TracedSurface", "RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits",
+            "ClearanceHits",
             "Isolines", "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
             "WallThickness", "HitTolerance", "LiveView"}  # fmt: skip
 

@@ -263,7 +263,7 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
 _NO_DERIVATIVE = (
     "a result of the wrapped function depends on its arguments by nothing that has a derivative: "
     "zero would be wrong where it depends on whether rays hit (hits.is_hit, hits.status), on what "
-    "was hit, or on NumPy arrays. Take t, position or field.value, or detach that result"
+    "was hit, or on NumPy arrays. Take t, position, clearance or field.value, or detach that result"
 )
 
 # JAX.

@@ -1,6 +1,6 @@
 """The names of the package, and where they are."""
 
-from .hits import Hits, trace
+from .hits import ClearanceHits, Hits, trace
 from .level_contact import HitTolerance, RayStatus
 from .ray_crossings import RayCrossings, crossings
 from .surface import Side, Surface
@@ -9,6 +9,7 @@ from .trace_options import TraceKeywords, TraceOptions
 from .traced_surface import TracedSurface, traced_surface
 
 __all__ = [
+    "ClearanceHits",
     "HitTolerance",
     "Hits",
     "MarchResult",

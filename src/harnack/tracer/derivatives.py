@@ -97,8 +97,8 @@ class _NoDerivative(dr.CustomOp):
         """Raise NotImplementedError, unless the result is not used."""
         if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
-                f"{self._result_name} of hits cannot be differentiated, only t and position can: "
-                "detach it where it is used (drjit.detach)"
+                f"{self._result_name} of hits cannot be differentiated, only t, position and "
+                "clearance can: detach it where it is used (drjit.detach)"
             )
 
 
@@ -165,15 +165,9 @@ def attach_derivatives(
         normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
         dr.eval(t_hit, x, slope, normal)
     point = dr.fma(backend.Array3f(t_hit), d, o)
-    # The change of f at the hit by changes of the ray: a zero with a derivative, since x is the
-    # same point without derivatives.
-    change = dr.dot(sample.gradient, point - x)
-    if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(tracer.field)):
-        # f depends on parameters, too: its own derivative has all of them.
-        value = value_with_parameters(tracer.field, tracer.evaluator, point)
-        change = value - dr.detach(value)
-    change = change - _change_of_nearest(tracer, sample.value)
-    t = dr.select(is_hit, _with_derivative(t_hit, change, slope, is_hit), t)
+    change = change_of_value(tracer, point, x, sample.gradient)
+    change = change - change_of_nearest_level(tracer, sample.value)
+    t = dr.select(is_hit, with_implicit_derivative(t_hit, change, slope, is_hit), t)
     return t, _with_normal_derivative(tracer, o, d, t, normal, is_hit)
 
 
@@ -207,10 +201,10 @@ def _on_plane(tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real
     x = dr.fma(tracer.backend.Array3f(t_hit), d, o)
     # A zero with a derivative: that of the distance of a point at fixed t from the plane.
     change = dr.dot(end.gradient, x - dr.detach(x))
-    return _with_derivative(end.t, change, slope, end.at_jump)
+    return with_implicit_derivative(end.t, change, slope, end.at_jump)
 
 
-def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> Real:
+def with_implicit_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> Real:
     """Return t with the derivative of -change/slope on lanes of `is_attached`; infinite or NaN if
     the slope is 0 there.
 
@@ -220,7 +214,21 @@ def _with_derivative(t: Real, change: Real, slope: Real, is_attached: Mask) -> R
     return dr.replace_grad(t, -change * dr.select(is_attached, 1 / slope, 0))
 
 
-def _change_of_nearest(tracer: SurfaceTracer, f: Real) -> Real:
+def change_of_value(tracer: SurfaceTracer, point: Vec3, x: Vec3, gradient: Vec3) -> Real:
+    """Return a zero with a derivative: that of f at `point` by the point and by the parameters of
+    the field.
+
+    tracer: the surface. point: (3,) points, possibly with derivatives.
+    x, gradient: (3,) the same points without derivatives, and grad f there.
+    """
+    if any(dr.grad_enabled(parameter) for parameter in differentiable_parameters(tracer.field)):
+        # f depends on parameters, too: its own derivative has all of them.
+        value = value_with_parameters(tracer.field, tracer.evaluator, point)
+        return value - dr.detach(value)
+    return dr.dot(gradient, point - x)
+
+
+def change_of_nearest_level(tracer: SurfaceTracer, f: Real) -> Real:
     """Return a zero that carries a derivative: that of the level nearest to f on each lane. It is
     level - detach(level).
 
