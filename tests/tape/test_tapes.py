@@ -391,8 +391,9 @@ def test_ranges_contain_sums_of_products_that_cancel() -> None:
         (lambda x, y, z: hk.math.exp(-(x * x + y * y + z * z)) - math.exp(-4.0), 2.0),
         (lambda x, y, z: abs(x) ** 1.5 + abs(y) ** 2.5 + abs(z) ** 1.5 - 1, 1.0),
         (lambda x, y, z: 4 * (x * x + y * y + z * z) ** 0.5 - 4, 1.0),
+        (lambda x, y, z: 3 * x * x + y * (3 * y) + 1.5 * z * (2 * z) - 3, 1.0),
     ],
-    ids=["three squares", "logarithm", "bell curve", "powers", "root of powers"],
+    ids=["three squares", "logarithm", "bell curve", "powers", "root of powers", "multiples"],
 )
 def test_boxes_of_level_sets_by_half_spaces(formula: Any, face: float) -> None:
     corners = level_box(record(formula), (0.0,))
