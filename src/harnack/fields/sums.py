@@ -146,7 +146,7 @@ class FieldSum(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that contains the level sets: of a single term, that of its own level sets; of
         several terms, the domain or, without a domain, a box around volumes that are proved for
-        each of them (`sum_extents`)."""
+        each of them."""
         return self._weighted.extent(levels, self.domain)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
