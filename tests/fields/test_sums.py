@@ -345,6 +345,32 @@ def test_fields_that_fall_off_have_an_extent() -> None:
     assert (CLOUD - SMALL_CLOUD).extent((0.0,)) is None
 
 
+def test_sums_of_formulas_have_the_extents_of_their_terms() -> None:
+    blobs, other = (hk.fields.Blobs([[x, 0, 0]], 0.5) for x in (-1.0, 2.0))
+    box = blobs.extent((1.0,))
+    for field, level in ((2 * blobs, 1.0), (-blobs, -1.0), (0.1 - blobs, -0.9)):
+        assert field.extent((level,)) == box
+    both = (blobs - 0.5 * other).extent((0.7,))
+    assert both is not None
+    lower, upper = both.bounds()
+    assert lower[0] <= -1.5
+    assert upper[0] >= 2.5
+    assert (blobs - other).extent((0.0,)) is None  # which is all the space outside of both
+    hits = hk.trace(2 * blobs, [[-1, 0, 1e6], [0, 5, 9]], [[0, 0, -1]], level=2.0)
+    assert hits.status.tolist() == [hk.RayStatus.HIT, hk.RayStatus.MISS]
+    with pytest.raises(ValueError, match="level 0 of blobs"):
+        hk.trace(blobs - 0.5, [[0, 5, 9]], [[0, 0, -1]], level=-0.5)
+
+
+def test_products_are_0_where_a_factor_is() -> None:
+    first, second = (hk.expression(f"x^2 + y^2 + z^2 - {r}", domain=hk.Box((-3,) * 3, (3,) * 3))
+                     for r in (1, 4))  # fmt: skip
+    assert (first * second).extent((0.0,)) is not None
+    blobs, other = (hk.fields.Blobs([[x, 0, 0]], 0.5) for x in (-1.0, 2.0))
+    assert (blobs * other).extent((0.0,)) is None  # all the space outside of both
+    assert FieldProduct((blobs, other)).extent((0.0,)) is None
+
+
 _MESH = hk.geometry.example_meshes.icosphere(1)
 
 

@@ -61,6 +61,7 @@ FIELD_ROOMS = (
     "weights",
     "operands",
     "sum_jumps",
+    "sum_extents",
     "sums",
     "products",
     "combining",

@@ -4,6 +4,7 @@ formulas themselves."""
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from harnack.fields.batched_fields import FieldCache
 from harnack.fields.solids.solid import Solid
 from harnack.tape import pruning
 from harnack.tape.cells import TapeCells
+from harnack.tape.level_box import level_box
 from harnack.tape.pruning import BoxLimits, BoxTapes
 from harnack.tape.recording import Tape, record
 from tests.tape.random_models import random_model
@@ -368,3 +370,52 @@ def test_a_text_of_many_spheres_has_a_proved_box() -> None:
     near = np.linalg.norm(centers[:, None, :2] - centers[None, :, :2], axis=-1)
     tops = np.where(near < 0.1, centers[:, 2] + np.sqrt(np.fmax(0.01 - near**2, 0)), -np.inf)
     np.testing.assert_allclose(hits.t, 3.0 - tops.max(axis=1), atol=1e-3)
+
+
+def test_ranges_contain_sums_of_products_that_cancel() -> None:
+    """The rounding of a product is larger than any fraction of what is left of it."""
+    numbers = np.random.default_rng(0).uniform(1.6, 1.7, 400)
+    tape = record(lambda x, y, z: -3.0 * x + 4.95)
+    boxes = np.repeat(numbers[:, None], 3, axis=1)
+    lists = BoxTapes.whole(tape).subset(np.zeros(400, np.int64))
+    found = lists.pruned(boxes, boxes, BoxLimits.unlimited(400, ()))
+    for number, low, high in zip(numbers.tolist(), found.low, found.high, strict=True):
+        assert Fraction(low) <= Fraction(4.95) - 3 * Fraction(number) <= Fraction(high)
+
+
+@pytest.mark.parametrize(
+    ("formula", "face"),
+    [
+        (lambda x, y, z: 4 - x * x - y * y - z * z, 2.0),
+        (lambda x, y, z: hk.math.log(x * x + y * y + z * z), 1.0),
+        (lambda x, y, z: hk.math.exp(-(x * x + y * y + z * z)) - math.exp(-4.0), 2.0),
+        (lambda x, y, z: abs(x) ** 1.5 + abs(y) ** 2.5 + abs(z) ** 1.5 - 1, 1.0),
+        (lambda x, y, z: 4 * (x * x + y * y + z * z) ** 0.5 - 4, 1.0),
+        (lambda x, y, z: 3 * x * x + y * (3 * y) + 1.5 * z * (2 * z) - 3, 1.0),
+    ],
+    ids=["three squares", "logarithm", "bell curve", "powers", "root of powers", "multiples"],
+)
+def test_boxes_of_level_sets_by_half_spaces(formula: Any, face: float) -> None:
+    corners = level_box(record(formula), (0.0,))
+    assert corners is not None
+    lower, upper = corners
+    assert (upper >= face).all()
+    assert (lower <= -face).all()
+    assert (upper - lower).max() <= 2.2 * face
+
+
+def test_numbers_that_overflow_are_not_infinite_in_ranges() -> None:
+    """exp(|x|)^0.001 is 3 where |x| = 1098.6, though exp(710) overflows."""
+    corners = level_box(
+        record(
+            lambda x, y, z: hk.math.maximum(
+                hk.math.exp(abs(x)) ** 0.001 - 3, hk.math.norm(y, z) - 1
+            )
+        ),
+        (0.0,),
+    )
+    assert corners is None or corners[1][0] > 1098.0
+    tape = record(lambda x, y, z: hk.math.norm(x * 1e200, y * 1e200))
+    one = np.ones((1, 3))
+    found = BoxTapes.whole(tape).pruned(one, one, BoxLimits.unlimited(1, ()))
+    assert found.low[0] <= math.sqrt(2) * 1e200 <= found.high[0]

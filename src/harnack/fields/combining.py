@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -13,10 +13,15 @@ from harnack.backend.validation import as_finite
 from harnack.fields.field import Field
 from harnack.fields.formula import Formula, has_own_formula, own_formula
 from harnack.fields.operands import common_domain, common_traits
-from harnack.fields.products import FieldProduct
+from harnack.fields.products import FieldProduct, extent_of_product
+from harnack.fields.sum_extents import WeightedTerms
 from harnack.fields.sums import FieldSum
+from harnack.fields.tape_evaluator import extent_of_long_formula
 from harnack.fields.weights import as_number, is_number, separate_weights
 from harnack.name_suggestions import with_article
+
+if TYPE_CHECKING:
+    from harnack.geometry import Volume
 
 
 def added(field: Any, other: Any, *, sign: float = 1.0) -> Field:
@@ -160,6 +165,18 @@ class FormulaSum(Formula):
         ):
             object.__setattr__(self, name, value)
 
+    @property
+    def _weighted(self) -> WeightedTerms:
+        return WeightedTerms(self.terms, self.weights, self.constant)
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A volume that contains the level sets, as of `FieldSum`; or the box of a formula that is
+        interpreted."""
+        return self._weighted.extent(levels, self.domain) or extent_of_long_formula(self, levels)
+
+    def validate_levels(self, levels: tuple[float, ...]) -> None:
+        self._weighted.validate_levels(levels)
+
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         total: Any = self.constant
         for term, weight in zip(self.terms, self.weights, strict=True):
@@ -180,6 +197,12 @@ class FormulaProduct(Formula):
         """Set what follows from the factors: the domain and the traits."""
         object.__setattr__(self, "domain", common_domain(self.factors))
         object.__setattr__(self, "traits", common_traits(self.factors))
+
+    def extent(self, levels: tuple[float, ...]) -> Volume | None:
+        """A volume that contains the level sets, as of `FieldProduct`; or the box of a formula that
+        is interpreted."""
+        known = extent_of_product(self.factors, levels, self.domain)
+        return known or extent_of_long_formula(self, levels)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         first, second = self.factors

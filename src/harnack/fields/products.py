@@ -89,11 +89,7 @@ class FieldProduct(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that contains the level sets: at the level 0, on which one of the factors is 0,
         a box around theirs; else the domain."""
-        if any(level != 0 for level in levels):
-            return self.domain
-        volumes = [factor.extent((0.0,)) for factor in self.factors]
-        known = [volume for volume in volumes if volume is not None]
-        return (box_around_volumes(known) if len(known) == 2 else None) or self.domain
+        return extent_of_product(self.factors, levels, self.domain)
 
     @accepts_dask_arrays("points")
     @accepts_tensors
@@ -109,6 +105,28 @@ class FieldProduct(Field):
         inner = Plan(ray_count=plan.ray_count)
         first, second = (factor.evaluator(backend, inner) for factor in self.factors)
         return ProductEvaluator(first, second)
+
+
+def extent_of_product(
+    factors: Iterable[Field], levels: tuple[float, ...], domain: Volume | None
+) -> Volume | None:
+    """A volume that contains the level sets of a product with this domain: at the level 0, on which
+    one of the factors is 0, a box around theirs; else the domain. None if none is known."""
+    if any(level != 0 for level in levels):
+        return domain
+    volumes = [_zero_extent(factor) for factor in factors]
+    known = [volume for volume in volumes if volume is not None]
+    return (box_around_volumes(known) if len(known) == len(volumes) else None) or domain
+
+
+def _zero_extent(factor: Field) -> Volume | None:
+    """A volume that contains the points at which a field is 0; None if none is known, and if the
+    level 0 is refused, as that of blobs, which are 0 in all of the space outside of them."""
+    try:
+        factor.validate_levels((0.0,))
+    except ValueError:
+        return None
+    return factor.extent((0.0,))
 
 
 @dataclass(frozen=True, eq=False)

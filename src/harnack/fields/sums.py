@@ -39,12 +39,12 @@ from harnack.fields.operands import (
     common_domain,
     common_period,
     common_traits,
-    far_from_zero,
     joined_boundary,
     nothing_known_message,
     sample_rays,
     weighted_boundary,
 )
+from harnack.fields.sum_extents import WeightedTerms
 from harnack.fields.sum_jumps import WeightedJumps
 from harnack.fields.weights import (
     checked_number,
@@ -54,7 +54,6 @@ from harnack.fields.weights import (
     host_number,
     host_numbers,
 )
-from harnack.geometry.clip_volumes import box_around_volumes
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Precision, Real, Vec3
@@ -147,55 +146,17 @@ class FieldSum(Field):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that contains the level sets: of a single term, that of its own level sets; of
         several terms, the domain or, without a domain, a box around volumes that are proved for
-        each of them (`_extents_of_terms`)."""
-        inner = self._levels_of_single(levels)
-        if inner is not None:
-            return self.terms[0].extent(inner)
-        if self.domain is not None:
-            return self.domain
-        volumes = [volume for level in levels for volume in self._extents_of_terms(level)]
-        known = [volume for volume in volumes if volume is not None]
-        return box_around_volumes(known) if known and len(known) == len(volumes) else None
-
-    def _extents_of_terms(self, level: float) -> list[Volume | None]:
-        """Volumes that together contain the level set of a level; None among them if one is not
-        known, as for terms that do not fall off with the distance.
-
-        Proof. Let g be the difference between the level and the constant. Where the sum of n terms
-        takes the level, one of the w_i f_i is at least g/n, if g > 0; at most g/n, if g < 0. If a
-        term is angle-valued, g is reduced by the nearest multiple of the period, and one of the w_i
-        f_i differs from each multiple of its own period by at least |g|/n: otherwise the sum would
-        differ from a multiple of the period by less than |g|. Where a term has such values, it has
-        these levels, or is on one side of them (`bounded_side_extent`).
-        """
-        pairs = zip(self.terms, self._weight_numbers, strict=True)
-        used = [(term, weight) for term, weight in pairs if weight != 0]
-        gap = level - self._constant_number
-        if self.period is not None:
-            gap = math.remainder(gap, self.period)
-        if gap == 0 or not used:
-            return [None]
-        distance_of_all = abs(gap) / len(used)
-        sign = None if self.period is not None else math.copysign(1.0, gap)
-        return [
-            far_from_zero(term, weight, distance_of_all, sign)
-            for term, weight in used
-            # Otherwise no value differs so much from the nearest multiple of the period.
-            if term.period is None or distance_of_all <= abs(weight) * 0.5 * term.period
-        ]
+        each of them."""
+        return self._weighted.extent(levels, self.domain)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
-        inner = self._levels_of_single(levels)
-        if inner is not None:
-            self.terms[0].validate_levels(inner)
+        self._weighted.validate_levels(levels)
 
-    def _levels_of_single(self, levels: tuple[float, ...]) -> tuple[float, ...] | None:
-        """The levels of the only term whose level sets are those of the sum; None if there are
-        several terms, or if the weight is 0."""
-        (weight, *others), constant = self._weight_numbers, self._constant_number
-        if others or weight == 0:
-            return None
-        return tuple((level - constant) / weight for level in levels)
+    @property
+    def _weighted(self) -> WeightedTerms:
+        """The terms with their weights, as Python numbers."""
+        numbers = tuple(self._weight_numbers)
+        return WeightedTerms(self.terms, numbers, self._constant_number, self.period)
 
     def describe(self) -> dict[str, Any]:
         """The number of terms, as a dictionary for users."""
@@ -229,7 +190,7 @@ class FieldSum(Field):
         return functools.reduce(operator.add, products)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> SumEvaluator:
-        levels = self._levels_of_single(plan.levels) or ()
+        levels = self._weighted.levels_of_single(plan.levels) or ()
         inner_plan = Plan(levels, plan.ray_count)
         moved = device_numbers(self.weights, backend, len(self.terms))
         terms = tuple(

@@ -63,6 +63,7 @@ COORDINATE_COUNT = 3
 # functions are wrong by at most four.
 _UNITS = 16.0
 _TINY = float(np.finfo(np.float64).tiny)
+_LARGEST = float(np.finfo(np.float64).max)
 _HUGE_ANGLE = 1e6
 
 
@@ -87,6 +88,7 @@ class Operation:
     box: of a function of the point, from its constants (c arrays), the lower and the upper corners
         (3 arrays each) of boxes: the function is at least the distance from the box outside of it;
         None if no box is known.
+    least: what no result is below, however it is rounded, so that a root of it is known.
     """
 
     name: str
@@ -99,34 +101,46 @@ class Operation:
     is_of_point: bool = False
     is_member: bool = False
     box: BoxFunction | None = None
+    least: float = -math.inf
 
     def rounded_ranges(self, operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
         """The range of the result on each box, rounded outwards. An end that is NaN becomes
-        infinite."""
+        infinite; a lower end that overflowed becomes the largest number, since an upper one does
+        not stay infinite in what is computed of it, as in log(exp(x))."""
+        slack = _UNITS * float(np.finfo(np.float64).eps)
         with np.errstate(all="ignore"):
             low, high = self.ranges(operands, constants)
-            slack = _UNITS * float(np.finfo(np.float64).eps)
-            low = low - (slack * np.abs(low) + _TINY)
-            high = high + (slack * np.abs(high) + _TINY)
+            below, above = (np.abs(end) * slack for end in (low, high))
+            # In place: memory is what this takes its time for.
+            below += _TINY
+            above += _TINY
+            np.subtract(low, below, out=below)
+            above += high
         # (fmax and fmin take the number in place of NaN.)
-        return np.fmax(low, -np.inf), np.fmin(high, np.inf)
+        np.fmax(below, self.least, out=below)
+        np.fmin(above, np.inf, out=above)
+        return np.minimum(below, _LARGEST, out=below), np.maximum(above, -_LARGEST, out=above)
 
 
 # Ranges.
 
 
 def _sum_of(terms: Sequence[Range]) -> Range:
-    """The range of the sum of numbers in these ranges. The rounding of one sum is a fraction of the
-    result, and is added for all operations. Those of several may exceed any fraction of the total,
-    so that the ends are widened by the size of the terms."""
-    if len(terms) == 2:
-        (low_a, high_a), (low_b, high_b) = terms
-        return low_a + low_b, high_a + high_b
-    size = sum(np.maximum(np.abs(low), np.abs(high)) for low, high in terms)
-    slack = 4 * float(np.finfo(np.float64).eps) * size
-    low: Any = sum(low for low, _ in terms)
-    high: Any = sum(high for _, high in terms)
-    return low - slack, high + slack
+    """The range of the sum of two numbers in these ranges. Its rounding is a fraction of the
+    result, and is added for all operations."""
+    (low_a, high_a), (low_b, high_b) = terms
+    return low_a + low_b, high_a + high_b
+
+
+def _sum_of_products(terms: Sequence[Range]) -> Range:
+    """The range of the sum of two to four rounded numbers in these ranges. The rounding may exceed
+    any fraction of the total, so that each end is widened by the size of what it is the sum of.
+    (The other end may be infinite.)"""
+    lows, highs = ([term[k] for term in terms] for k in (0, 1))
+    slack = 4 * float(np.finfo(np.float64).eps)
+    low, high = (functools.reduce(np.add, ends) for ends in (lows, highs))
+    sizes = [functools.reduce(np.add, [np.abs(end) for end in ends]) for ends in (lows, highs)]
+    return low - slack * sizes[0], high + slack * sizes[1]
 
 
 def _scaled(a: Range, factor: FloatArray) -> Range:
@@ -169,22 +183,28 @@ def _norm_ranges(p: float) -> RangeFunction:
 
 
 def _norm_on_numpy(sizes: Sequence[FloatArray], p: float) -> FloatArray:
-    """The p-norm of numbers >= 0; their largest where squares overflow."""
+    """The p-norm of numbers >= 0. Where squares overflow, they are divided by the largest."""
     if p != 2.0:
         return norm(*sizes, p=p)
+    length = _root_of_squares(sizes)
+    if np.isfinite(length).all():
+        return length
+    largest = functools.reduce(np.maximum, sizes)
+    scaled = largest * _root_of_squares([size / largest for size in sizes])
+    return np.where(np.isinf(length), np.where(np.isinf(largest), largest, scaled), length)
+
+
+def _root_of_squares(sizes: Sequence[FloatArray]) -> FloatArray:
     squares = sizes[0] * sizes[0]
     for size in sizes[1:]:
         squares += size * size
-    length = np.sqrt(squares)
-    if np.isfinite(length).all():
-        return length
-    return np.where(np.isinf(length), functools.reduce(np.maximum, sizes), length)
+    return np.sqrt(squares)
 
 
 def _affine_ranges(operands: Sequence[Range], constants: Sequence[FloatArray]) -> Range:
     *factors, shift = constants
     terms = [_scaled(a, factor) for a, factor in zip(operands, factors, strict=True)]
-    return _sum_of([*terms, (shift, shift)])
+    return _sum_of_products([*terms, (shift, shift)])
 
 
 def _power_ranges(n: float) -> RangeFunction:
@@ -259,9 +279,9 @@ def _function_ranges(function: ElementaryFunction) -> RangeFunction:
         is_known = (low >= domain_low) & (high <= domain_high)
         first, last = function.on_numpy(low), function.on_numpy(high)
         # The rounding of results near 0, such as that of a logarithm near 1.
-        slack = 1e-14 * (1.0 + np.maximum(abs(first), abs(last)))
         low, high = (last, first) if falls else (first, last)
-        return np.where(is_known, low - slack, -np.inf), np.where(is_known, high + slack, np.inf)
+        low, high = low - 1e-14 * (1.0 + abs(low)), high + 1e-14 * (1.0 + abs(high))
+        return np.where(is_known, low, -np.inf), np.where(is_known, high, np.inf)
 
     return ranges
 
@@ -651,7 +671,9 @@ def chain_operation(name: str) -> Operation:
 @functools.cache
 def norm_operation(count: int, p: float) -> Operation:
     """The p-norm of two or three numbers."""
-    return Operation(f"norm {count} {p}", count, 0, lambda a, k: norm(*a, p=p), _norm_ranges(p))
+    return Operation(
+        f"norm {count} {p}", count, 0, lambda a, k: norm(*a, p=p), _norm_ranges(p), least=0.0
+    )
 
 
 @functools.cache
@@ -688,6 +710,13 @@ def function_operation(function: ElementaryFunction) -> Operation:
         choice = _choice_of_absolute if function.name == "abs" else None
         _FUNCTIONS[function.name] = Operation(
             function.name, 1, 0, lambda a, k: function(a[0]), _function_ranges(function),
-            choice,
+            choice, least=_least_value(function),
         )  # fmt: skip
     return _FUNCTIONS[function.name]
+
+
+def _least_value(function: ElementaryFunction) -> float:
+    """What no value of a function is below."""
+    name, _, exponent = function.name.partition(" ")
+    is_positive = name in ("abs", "exp", "sqrt") or (name == "power" and float(exponent) % 2 == 0)
+    return 0.0 if is_positive else -math.inf

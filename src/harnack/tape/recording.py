@@ -340,10 +340,23 @@ class TapeNumber(FormulaNumber):
             return self._times_constant(other.shift)
         if not self.terms:
             return other._times_constant(self.shift)
+        square = self._multiple_of_square(other)
+        if square is not None:
+            return square
         a, b = self.index, other.index
         if a == b:
             return self.apply(power(2))
         return self._of_instruction(self.recorder.add(operation_named("product"), (a, b)))
+
+    def _multiple_of_square(self, other: TapeNumber) -> TapeNumber | None:
+        """The product with another number, if both are multiples of the same result: a multiple of
+        its square, which is never negative, as the range of a product may be; None for others."""
+        if self.shift or other.shift or len(self.terms) != 1 or len(other.terms) != 1:
+            return None
+        ((index, first),), ((other_index, second),) = self.terms, other.terms
+        if index != other_index or not _is_exact_product(first, second):
+            return None
+        return self._of_instruction(index).apply(power(2))._times_constant(first * second)
 
     def _times_constant(self, factor: float) -> TapeNumber:
         """This number times a constant. Of a constant, an instruction: the product is rounded."""
