@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
+import numpy.typing as npt
 
 from harnack.arithmetic import Interval, Jet, Values
 from harnack.arithmetic.jet import Dual
@@ -99,7 +100,7 @@ class TapeProgram:
         return TapeFormula(self, begin, end if active is True else dr.select(active, end, begin))
 
 
-def _encode(lists: BoxTapes) -> tuple[IntArray, IntArray, int]:
+def _encode(lists: BoxTapes) -> tuple[npt.NDArray[np.uint32], IntArray, int]:
     """The instructions of lists as words (n, 4); for each entry, and for the end, the number of
     instructions before it; and the number of slots in local memory.
 
