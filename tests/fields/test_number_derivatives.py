@@ -3,6 +3,7 @@ precision. Classes and arguments are found by their traits."""
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -199,3 +200,15 @@ def test_other_numbers_compile_nothing() -> None:
 
     step(0), step(1)
     assert compiled(lambda: (step(2), step(3))) == 0
+
+
+def test_a_class_with_another_function_has_no_derivatives_by_its_bases_formula() -> None:
+    class Bumpy(hk.Sphere):
+        def evaluate(self, p: Any) -> Any:
+            sample = hk.Sphere.evaluate(self, p)
+            return dataclasses.replace(sample, value=2 * sample.value, gradient=2 * sample.gradient)
+
+    radius = Float64(0.5)
+    dr.enable_grad(radius)
+    with pytest.raises(NotImplementedError, match="Bumpy cannot be differentiated"):
+        Bumpy(radius).value(Array3f64(1.0, 0.0, 0.0))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
@@ -35,6 +35,8 @@ __all__ = [
     "attached",
     "attached_vector",
     "gradient_with_parameters",
+    "has_own_formula",
+    "own_formula",
     "value_with_parameters",
     "with_attached_arguments",
 ]
@@ -48,7 +50,7 @@ def value_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Real:
     # By p, the derivative is the gradient of the sample, also at ties.
     value = Evaluator.differentiable_value(evaluator, p)
     at = _beside(dr.detach(p))
-    own = 0 * at.x + attached(field, backend_of(at)).formula(at.x, at.y, at.z)
+    own = 0 * at.x + _formula_of_attached(field, at)(at.x, at.y, at.z)
     return value + (own - dr.detach(own))
 
 
@@ -73,7 +75,7 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
     that. At ties of a maximum or minimum it is that of one side. evaluator: that of the field."""
     formula: Any = getattr(evaluator, "formula", None)
     if ATTACHED in vars(field):
-        formula = attached(field, backend_of(p)).formula
+        formula = _formula_of_attached(field, p)
     elif formula is None or getattr(evaluator, "uploaded", None) is not None:
         return None  # a recorded loop runs the instructions of a long formula
     elif any(map(dr.grad_enabled, differentiable_parameters(field))):
@@ -87,6 +89,12 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
     with dr.suspend_grad():
         value = evaluator.evaluate(dr.detach(p)).gradient
     return dr.replace_grad(value, gradient)
+
+
+def _formula_of_attached(field: Any, p: Vec3) -> Callable[[Any, Any, Any], Any]:
+    """The formula of a field with its numbers attached, on the backend of points p."""
+    own_formula(field)  # raises an error if a user's class has another function
+    return attached(field, backend_of(p)).formula
 
 
 def attached(value: Any, backend: Backend) -> Any:
@@ -166,3 +174,30 @@ def _as_parameter(number: Any, backend: Backend) -> Any:
         plain = np.array(dr.detach(number), np.float64).ravel()
         value = dr.opaque(backend.Float, float(plain[0]))
     return dr.replace_grad(value, backend.Float(number))
+
+
+def has_own_formula(field: Any) -> bool:
+    """Whether the method `formula` of a field gives its function f. It does not if a user's class
+    overrides `evaluate` or `evaluator`, and leaves the formula as it is."""
+    for kind in type(field).__mro__:
+        if "formula" in vars(kind) or kind.__module__.startswith("harnack."):
+            return True
+        if "evaluate" in vars(kind):  # a class that defines `evaluator` has it, too
+            return False
+    return True
+
+
+def own_formula(field: Any) -> Callable[[Any, Any, Any], Any]:
+    """The formula of a field, for a field whose formula is made of it.
+
+    Raises:
+        TypeError: a user's class has another function than its formula (`has_own_formula`).
+    """
+    if not has_own_formula(field):
+        name = type(field).__name__
+        raise TypeError(
+            f"{name} has a function of its own, and the formula of a class that it is derived "
+            "from, and here the formula is needed: define formula(x, y, z) of the same function "
+            f"in {name}"
+        )
+    return field.formula

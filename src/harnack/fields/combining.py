@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend.validation import as_finite
+from harnack.fields.attached_numbers import has_own_formula, own_formula
 from harnack.fields.field import Field
-from harnack.fields.formula import Formula, has_own_formula, own_formula
+from harnack.fields.formula import Formula
 from harnack.fields.operands import common_domain, common_traits
 from harnack.fields.products import FieldProduct, extent_of_product
 from harnack.fields.sum_extents import WeightedTerms

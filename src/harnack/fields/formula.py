@@ -125,33 +125,6 @@ def warn_if_slow_to_compile(field: Formula) -> None:
         )
 
 
-def has_own_formula(field: Field) -> bool:
-    """Whether the method `formula` of a field gives its function f. It does not if a user's class
-    overrides `evaluate` or `evaluator`, and leaves the formula as it is."""
-    for kind in type(field).__mro__:
-        if "formula" in vars(kind) or kind.__module__.startswith("harnack."):
-            return True
-        if "evaluate" in vars(kind):  # a class that defines `evaluator` has it, too
-            return False
-    return True
-
-
-def own_formula(field: Any) -> FormulaFunction:
-    """The formula of a field, for a field whose formula is made of it.
-
-    Raises:
-        TypeError: a user's class has another function than its formula (`has_own_formula`).
-    """
-    if not has_own_formula(field):
-        name = type(field).__name__
-        raise TypeError(
-            f"{name} has a function of its own, and the formula of a class that it is derived "
-            "from, and here the formula is needed: define formula(x, y, z) of the same function "
-            f"in {name}"
-        )
-    return field.formula
-
-
 def with_device_numbers(field: Any, backend: Backend) -> Any:
     """A copy of a field that is a dataclass, for a backend. Attributes that are numbers become
     kernel parameters, which can change without compiling the kernel again; attributes that are

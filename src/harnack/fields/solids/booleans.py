@@ -27,10 +27,11 @@ from harnack.backend.validation import as_finite, as_real, no_derivatives
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.attached_numbers import has_own_formula, own_formula
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, is_checked
-from harnack.fields.formula import has_own_formula, on_backend, own_formula, probe_jets
+from harnack.fields.formula import on_backend, probe_jets
 from harnack.fields.parameters import record_call
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,

@@ -20,8 +20,9 @@ from harnack.arithmetic import cos, maximum, minimum, sin
 from harnack.arithmetic.operators import tally_of
 from harnack.backend.elementary import fmax, fmin
 from harnack.enclosures import Lipschitz, Promise
+from harnack.fields.attached_numbers import own_formula
 from harnack.fields.evaluator import POINTS, Plan
-from harnack.fields.formula import own_formula, probe_jets, with_device_numbers
+from harnack.fields.formula import probe_jets, with_device_numbers
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction
 from harnack.fields.solids.solid import (
     AXES,

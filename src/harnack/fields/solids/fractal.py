@@ -20,8 +20,9 @@ from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_finite, as_integer_in_range, as_positive
 from harnack.enclosures import Lipschitz, TaylorRemainder
+from harnack.fields.attached_numbers import own_formula
 from harnack.fields.evaluator import POINTS, Plan
-from harnack.fields.formula import Formula, own_formula, with_device_numbers
+from harnack.fields.formula import Formula, with_device_numbers
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction, is_jet
 from harnack.fields.solids.solid import FormulaSolid
 from harnack.name_suggestions import is_one_of

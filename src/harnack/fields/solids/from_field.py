@@ -22,10 +22,11 @@ from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
 from harnack.backend.validation import as_finite, no_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
+from harnack.fields.attached_numbers import has_own_formula, own_formula
 from harnack.fields.clearance import bounded_side_extent
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
-from harnack.fields.formula import Formula, has_own_formula, on_backend, own_formula
+from harnack.fields.formula import Formula, on_backend
 from harnack.fields.formula_evaluator import is_jet
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh

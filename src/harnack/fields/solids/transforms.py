@@ -23,9 +23,9 @@ from harnack.backend.validation import as_triple, check_no_derivatives, has_deri
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.attached_numbers import attached, attached_vector
+from harnack.fields.attached_numbers import attached, attached_vector, own_formula
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.formula import own_formula, with_device_numbers
+from harnack.fields.formula import with_device_numbers
 from harnack.fields.formula_evaluator import (
     FormulaEvaluator,
     FormulaFunction,
