@@ -100,7 +100,8 @@ MAKERS = dict(makers())
 # By whose numbers there are derivatives.
 ATTACHED = {
     "Solid.blended": ("other", "radius", "power", "intersect"), "Solid.offset": ("distance",),
-    "Solid.translated": ("offset",),
+    "Solid.translated": ("offset",), "Solid.rotated": ("degrees", "axis"),
+    "Solid.scaled": ("factors",),
 }  # fmt: skip
 
 

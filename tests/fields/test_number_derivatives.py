@@ -47,6 +47,13 @@ OTHERS: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
             BOX.translated(offset).translated((0.1, 0.0, 0.0)) | hk.Torus(0.8, 0.1)
         ).offset(d),
     ),
+    "turned and scaled": (
+        {"degrees": 25.0, "factor": 1.2, "offset": (0.1, 0.0, 0.1)},
+        lambda degrees, factor, offset: (
+            BOX.rotated(degrees, (1.0, 2.0, 0.5)).scaled(factor).translated(offset)
+            & hk.Sphere(0.9).translated((0.1, 0.0, 0.0)).scaled(factor)
+        ),
+    ),
     "a formula": (
         {"a": 1.3, "b": 0.4},
         lambda a, b: hk.expression(
@@ -142,8 +149,9 @@ def test_numbers_that_would_be_lost_are_refused() -> None:
     for make in (
         lambda: hk.solids.Plane((r, 0, 0), 0.1),
         lambda: hk.solids.Superellipsoid((r, 2.0), (1, 1, 1)),
-        lambda: hk.Sphere(0.3).rotated(r),
-        lambda: hk.Sphere(0.3).scaled(r),
+        lambda: hk.Sphere(0.3).rotated(10, (0, 1, r)),
+        lambda: hk.Sphere(0.3).scaled((r, 1, 1)),
+        lambda: hk.Sphere(0.3).transformed([[r, 0, 0], [0, 1, 0], [0, 0, 1]]),
         lambda: hk.Sphere(r).twisted(10),
         lambda: hk.Sphere(r).shell(0.1),
         lambda: hk.solids.struts([[0, 0, 0], [1, 0, 0]], [[0, 1]], r),

@@ -263,7 +263,6 @@ class Solid(Field):
 
         return self._apply_map(AffineMap.translation(offset))
 
-    @no_derivatives
     def rotated(self, degrees: float, axis: str | Sequence[float] = "z") -> Solid:
         """The solid, rotated about an axis through the origin by an angle in degrees,
         counter-clockwise as seen from the positive end of the axis.
@@ -274,7 +273,6 @@ class Solid(Field):
 
         return self._apply_map(AffineMap.rotation(degrees, axis))
 
-    @no_derivatives
     def scaled(self, factors: float | Sequence[float]) -> Solid:
         """The solid, scaled about the origin.
 

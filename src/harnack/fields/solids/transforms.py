@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,7 +20,13 @@ import numpy.typing as npt
 
 from harnack.arithmetic import Jet
 from harnack.backend.elementary import max_norm, safe_norm
-from harnack.backend.validation import as_triple, check_no_derivatives, has_derivatives
+from harnack.backend.validation import (
+    as_positive,
+    as_real,
+    as_triple,
+    check_no_derivatives,
+    has_derivatives,
+)
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
@@ -60,13 +67,13 @@ class AffineMap(SpaceMap, Parametrized):
         that multiplies all lengths by the same factor) it is that factor, so that a distance stays
         a distance; for other maps it is 1. For a composition of maps it is the product of their
         factors.
-    attached_offset: the translation vector as Dr.Jit numbers with derivatives; None if it has none.
+    attached: the numbers with derivatives that the map was made of; None if there are none.
     """
 
     matrix: tuple[tuple[float, ...], ...]
     translation_vector: tuple[float, ...]
     value_factor: float
-    attached_offset: Any = dataclasses.field(default=None, repr=False, compare=False)
+    attached: _AttachedNumbers | None = dataclasses.field(default=None, repr=False, compare=False)
 
     @classmethod
     def of_arrays(cls, matrix: npt.ArrayLike, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> AffineMap:
@@ -114,9 +121,9 @@ class AffineMap(SpaceMap, Parametrized):
     @classmethod
     def translation(cls, offset: Sequence[float]) -> AffineMap:
         """The translation u -> u + offset."""
-        if has_derivatives(offset):
+        if _is_attached(offset, "an offset"):
             plain = cls.of_arrays(np.eye(3), as_triple(offset, "offset"))
-            return replace(plain, attached_offset=offset)
+            return replace(plain, attached=_AttachedNumbers("offset", offset, _inverse_translation))
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
@@ -128,6 +135,7 @@ class AffineMap(SpaceMap, Parametrized):
 
         axis: "x", "y", "z" or a vector (3,).
         """
+        check_no_derivatives("the axis of a rotation", axis)
         if isinstance(axis, str):
             unit = np.eye(3)[axis_index(axis)]
         else:
@@ -141,14 +149,22 @@ class AffineMap(SpaceMap, Parametrized):
             unit = unit / length
         # Rodrigues' formula: I + sin(angle) k + (1 - cos(angle)) k^2, with k the matrix of the
         # cross product with the axis.
-        angle = math.radians(float(degrees))
+        angle = math.radians(as_real(degrees, "the angle of a rotation"))
         k = np.cross(np.eye(3), unit)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+        if _is_attached(degrees, "the angle of a rotation"):
+            inverse = functools.partial(_inverse_rotation, k)
+            attached_angle = _AttachedNumbers("degrees", degrees, inverse)
+            return replace(cls.of_arrays(turn), attached=attached_angle)
         return cls.of_arrays(turn)
 
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
         """The scaling u -> factors u, by one positive factor, or by one for each axis."""
+        if _is_attached(factors, "a scaling by several factors", is_vector=False):
+            factor = as_positive(factors, "a factor with derivatives, of all axes,")
+            attached_factor = _AttachedNumbers("factors", factors, _inverse_scaling)
+            return replace(cls.of_arrays(factor * np.eye(3)), attached=attached_factor)
         sizes = np.asarray(factors, dtype=np.float64)
         # Any other shape becomes NaN, which is refused below.
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
@@ -158,13 +174,14 @@ class AffineMap(SpaceMap, Parametrized):
 
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of `of_arrays`."""
-        offset = self.translation_vector if self.attached_offset is None else self.attached_offset
-        return {"matrix": self.matrix, "offset": offset}
+        arguments: dict[str, Any] = {"matrix": self.matrix, "offset": self.translation_vector}
+        own = self.attached
+        return arguments if own is None else {**arguments, own.name: own.value}
 
     def replace(self, **changes: Any) -> AffineMap:
         """The map of another matrix or offset, by `of_arrays`. The factor of values changes as that
         of the matrices does."""
-        check_no_derivatives("an AffineMap", changes)
+        check_no_derivatives("an AffineMap", changes, self.constructor_arguments())
         old = AffineMap.of_arrays(self.matrix, self.translation_vector)
         new = AffineMap.of_arrays(**(self.constructor_arguments() | changes))
         return replace(new, value_factor=self.value_factor / old.value_factor * new.value_factor)
@@ -172,10 +189,8 @@ class AffineMap(SpaceMap, Parametrized):
     def apply(self, solid: Solid) -> Solid:
         """The image of a solid under this map. If the solid is itself the image of another under an
         affine map, the two maps are composed to one."""
-        is_attached = self.attached_offset is not None
-        if isinstance(solid, TransformedSolid) and not (
-            is_attached or solid.map.attached_offset is not None
-        ):
+        is_plain = self.attached is None
+        if isinstance(solid, TransformedSolid) and is_plain and solid.map.attached is None:
             m, b = np.array(self.matrix), np.array(self.translation_vector)
             inner = solid.map
             total = AffineMap.of_arrays(
@@ -290,10 +305,11 @@ class TransformedSolid(SolidOfField):
         """The copy whose formula has the attached numbers of the inner solid and of the map."""
         other = copy.copy(self)
         object.__setattr__(other, "field", attached(self.field, backend))
-        if self.map.attached_offset is not None:
-            offset = attached_vector(self.map.attached_offset, 3, backend)
-            inverse = replace(self.inverse_map, translation_vector=offset)
-            object.__setattr__(other, "inverse_map", inverse)
+        own = self.map.attached
+        if own is not None:
+            object.__setattr__(
+                other, "inverse_map", own.inverse(self.inverse_map, own.value, backend)
+            )
         return other
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -309,6 +325,58 @@ class TransformedSolid(SolidOfField):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return _formula_of_image(own_formula(self.field), self.inverse_map, x, y, z)
+
+
+@dataclass(frozen=True, eq=False)
+class _AttachedNumbers:
+    """Numbers with derivatives that an affine map was made of.
+
+    name, value: what they are, and the numbers.
+    inverse: makes the inverse map of them on a backend, from that without derivatives.
+    """
+
+    name: str
+    value: Any
+    inverse: Callable[[_InverseMap, Any, Backend], _InverseMap]
+
+
+def _is_attached(value: Any, name: str, *, is_vector: bool = True) -> bool:
+    """Whether a number or vector is one of Dr.Jit with derivatives. Raises NotImplementedError for
+    other values that carry derivatives. is_vector: whether it may be a tuple or list."""
+    if not has_derivatives(value):
+        return False
+    entries = value if is_vector and isinstance(value, tuple | list) else (value,)
+    others = [e for e in cast("Any", entries) if not dr.is_array_v(cast("Any", type(e)))]
+    check_no_derivatives(name, others)
+    return True
+
+
+def _inverse_translation(plain: _InverseMap, offset: Any, backend: Backend) -> _InverseMap:
+    return replace(plain, translation_vector=attached_vector(offset, 3, backend))
+
+
+def _inverse_rotation(
+    k: FloatArray, plain: _InverseMap, degrees: Any, backend: Backend
+) -> _InverseMap:
+    """The inverse of a rotation: I - sin(angle) k + (1 - cos(angle)) k^2.
+
+    k: the matrix of the cross product with the axis.
+    """
+    angle = attached_vector(degrees, 1, backend)[0] * (math.pi / 180)
+    sine, versine, square = dr.sin(angle), 1 - dr.cos(angle), k @ k
+    rows = tuple(
+        tuple(
+            versine * float(square[i, j]) - sine * float(k[i, j]) + float(i == j) for j in range(3)
+        )
+        for i in range(3)
+    )
+    return replace(plain, rows=rows)
+
+
+def _inverse_scaling(plain: _InverseMap, factor: Any, backend: Backend) -> _InverseMap:
+    size = attached_vector(factor, 1, backend)[0]
+    rows = tuple(tuple(1 / size if i == j else 0.0 for j in range(3)) for i in range(3))
+    return replace(plain, rows=rows, factor=size)
 
 
 def _formula_of_image(
