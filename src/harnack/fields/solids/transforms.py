@@ -345,8 +345,9 @@ def _is_attached(value: Any, name: str, *, is_vector: bool = True) -> bool:
     other values that carry derivatives. is_vector: whether it may be a tuple or list."""
     if not has_derivatives(value):
         return False
-    entries = value if is_vector and isinstance(value, tuple | list) else (value,)
-    others = [e for e in cast("Any", entries) if not dr.is_array_v(cast("Any", type(e)))]
+    is_sequence = is_vector and isinstance(value, tuple | list)
+    entries: list[Any] = list(cast("Any", value)) if is_sequence else [value]
+    others = [e for e in entries if not dr.is_array_v(cast("Any", type(e)))]
     check_no_derivatives(name, others)
     return True
 
