@@ -78,7 +78,8 @@ def makers() -> Iterator[tuple[str, Callable[..., Any]]]:
             continue  # they have derivatives by vertices and weights
         yield kind.__name__, kind
         for name, own in vars(kind).items():
-            if isinstance(own, classmethod) and not name.startswith("_"):
+            copies = getattr(getattr(own, "__func__", None), "copies_numbers", False)
+            if isinstance(own, classmethod) and not name.startswith("_") and not copies:
                 yield f"{kind.__name__}.{name}", getattr(kind, name)
     for field in (hk.DipolePotential(POINTS, POINTS), hk.WindingNumber(POINTS[:3], [[0, 1, 2]])):
         move = getattr(field, "with_points", None) or field.with_vertices

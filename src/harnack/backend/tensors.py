@@ -416,8 +416,9 @@ def _as_tensor(value: Any) -> Any:
     """
     if not dr.is_array_v(cast("Any", type(value))):
         raise TypeError(
-            "a function for JAX returns Dr.Jit arrays or tensors, in tuples, lists and "
-            f"dictionaries, not {type(value).__name__}: vars(hits) is a dictionary of hits"
+            "a wrapped function returns Dr.Jit arrays or tensors, in tuples, lists and "
+            f"dictionaries, not {type(value).__name__}: vars(hits) is a dictionary of hits, and "
+            "hits are such arrays if the rays are arguments of the function"
         )
     return value if is_tensor(value) else array_to_tensor(value, (dr.width(value),))
 

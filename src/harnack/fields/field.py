@@ -223,8 +223,9 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         # Public class methods are taken as further constructors.
         for name, attribute in list(vars(cls).items()):
             if isinstance(attribute, classmethod) and not name.startswith("_"):
-                checked_maker = no_derivatives(cast("Any", attribute).__func__)
-                setattr(cls, name, classmethod(checked_maker))
+                maker = cast("Any", attribute).__func__
+                if not getattr(maker, "copies_numbers", False):
+                    setattr(cls, name, classmethod(no_derivatives(maker)))
         defines_evaluator = "evaluator" in vars(cls)
         if defines_evaluator and not cls.__module__.startswith("harnack."):
             cls.evaluator = cast("Any", _with_checks(cls.evaluator))
@@ -415,6 +416,13 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         The default is empty.
         """
         return {}
+
+
+def copies_numbers(maker: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator for a class method of a field that copies numbers without their derivatives, as its
+    documentation says, so that it need not refuse those that have some."""
+    cast("Any", maker).copies_numbers = True
+    return maker
 
 
 def is_checked(value: Any) -> bool:

@@ -20,7 +20,7 @@ from harnack.enclosures.samples import RaySample, Sample
 from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.clearance import occupied_cells
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Traits
+from harnack.fields.field import Field, Traits, copies_numbers
 from harnack.fields.networks.activations import Activation, ReLU, activation_of
 from harnack.fields.networks.box_ranges import ranges_in_boxes
 from harnack.fields.networks.cell_networks import networks_of_cells
@@ -184,6 +184,7 @@ class Network(Field):
         )  # fmt: skip
 
     @classmethod
+    @copies_numbers
     def from_torch(cls, module: Any, *, domain: Volume | None = None, level: float = 0.0) -> Self:
         """Take the weights of a torch.nn.Sequential of Linear layers with an activation between
         each two: ReLU, Tanh, Softplus, ELU, or a module named Sine or SineLayer with an attribute
@@ -192,7 +193,8 @@ class Network(Field):
         A Softplus of PyTorch is z itself beyond its threshold, by default 20, where this one
         differs from it by less than exp(-20)/beta.
 
-        module: the module; later changes of it change nothing here.
+        module: the module. Its weights are copied: later changes of it change nothing here, and
+            nothing can be differentiated by them.
         domain, level: as of `Network`.
 
         Raises:
