@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
-import numpy as np
 
 from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
@@ -137,9 +136,9 @@ def _attached_number(given: Any, old: Any, backend: Backend) -> Any:
     """The argument `given` in the form of the attribute `old`, a number, a tuple of numbers or what
     contains fields."""
     if isinstance(old, float):
-        return attached_vector(given, 1, backend)[0] if _has_array(given) else old
+        return attached_vector(given, [old], backend)[0] if _has_array(given) else old
     if isinstance(old, tuple) and _has_array(given):
-        return attached_vector(given, len(cast("Any", old)), backend)
+        return attached_vector(given, cast("Any", old), backend)
     return attached(old, backend)
 
 
@@ -149,31 +148,32 @@ def _has_array(value: Any) -> bool:
     return any(dr.is_array_v(cast("Any", type(entry))) for entry in entries)
 
 
-def attached_vector(value: Any, count: int, backend: Backend) -> tuple[Any, ...]:
+def attached_vector(value: Any, plain: Sequence[float], backend: Backend) -> tuple[Any, ...]:
     """The numbers of a Dr.Jit vector, array or tensor, or of a tuple of numbers, as numbers of a
-    backend, with their derivatives."""
+    backend, with their derivatives. plain: their values."""
     if isinstance(value, tuple | list):
-        entries: list[Any] = [
-            attached_vector(entry, 1, backend)[0] if _has_array(entry) else backend.Float(entry)
-            for entry in cast("Any", value)
-        ]
-        return tuple(entries)
-    if dr.is_tensor_v(value):
-        value = value.array
-    if dr.depth_v(value) > 1:
-        return tuple(_as_parameter(entry, backend) for entry in value)
-    kind = cast("Any", type(value))
-    index = dr.uint32_array_t(kind)
-    return tuple(_as_parameter(dr.gather(kind, value, index(k)), backend) for k in range(count))
+        entries = cast("Any", value)
+    else:
+        flat = value.array if dr.is_tensor_v(value) else value
+        kind = cast("Any", type(flat))
+        index = dr.uint32_array_t(kind)
+        is_vector = dr.depth_v(kind) > 1
+        entries = flat if is_vector else [
+            dr.gather(kind, flat, index(k)) for k in range(len(plain))
+        ]  # fmt: skip
+    return tuple(
+        _as_parameter(entry, number, backend) for entry, number in zip(entries, plain, strict=True)
+    )
 
 
-def _as_parameter(number: Any, backend: Backend) -> Any:
-    """A number of a backend with the derivative of another one, whose value is a kernel parameter:
-    as a literal, each value would compile another kernel."""
+def _as_parameter(entry: Any, plain: float, backend: Backend) -> Any:
+    """A number of a backend with the derivative of a Dr.Jit number, if it is one. Its value is a
+    kernel parameter: as a literal, each value would compile another kernel."""
     with dr.suspend_grad():
-        plain = np.array(dr.detach(number), np.float64).ravel()
-        value = dr.opaque(backend.Float, float(plain[0]))
-    return dr.replace_grad(value, backend.Float(number))
+        value = dr.opaque(backend.Float, plain)
+    if dr.is_tensor_v(entry):
+        entry = entry.array
+    return dr.replace_grad(value, backend.Float(entry)) if _has_array(entry) else value
 
 
 def has_own_formula(field: Any) -> bool:

@@ -353,7 +353,9 @@ def _is_attached(value: Any, name: str, *, is_vector: bool = True) -> bool:
 
 
 def _inverse_translation(plain: _InverseMap, offset: Any, backend: Backend) -> _InverseMap:
-    return replace(plain, translation_vector=attached_vector(offset, 3, backend))
+    return replace(
+        plain, translation_vector=attached_vector(offset, plain.translation_vector, backend)
+    )
 
 
 def _inverse_rotation(
@@ -363,7 +365,8 @@ def _inverse_rotation(
 
     k: the matrix of the cross product with the axis.
     """
-    angle = attached_vector(degrees, 1, backend)[0] * (math.pi / 180)
+    plain_angle = as_real(degrees, "the angle of a rotation")
+    angle = attached_vector(degrees, [plain_angle], backend)[0] * (math.pi / 180)
     sine, versine, square = dr.sin(angle), 1 - dr.cos(angle), k @ k
     rows = tuple(
         tuple(
@@ -375,7 +378,7 @@ def _inverse_rotation(
 
 
 def _inverse_scaling(plain: _InverseMap, factor: Any, backend: Backend) -> _InverseMap:
-    size = attached_vector(factor, 1, backend)[0]
+    size = attached_vector(factor, [plain.factor], backend)[0]
     rows = tuple(tuple(1 / size if i == j else 0.0 for j in range(3)) for i in range(3))
     return replace(plain, rows=rows, factor=size)
 
