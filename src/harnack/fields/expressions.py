@@ -200,7 +200,7 @@ def _check_tree(text: str, node: ast.expr, parameters: Iterable[str], depth: int
                 text,
                 f"{node.id!r} is unknown, there are {', '.join(names)} and {', '.join(_FUNCTIONS)}"
                 f"{did_you_mean(node.id, (*names, *_FUNCTIONS))}; of a number of your own, give "
-                f"its value as {node.id}=1.0",
+                f'parameters={{"{node.id}": 1.0}}',
             )
     elif isinstance(node, ast.Constant):
         value = node.value
