@@ -356,7 +356,7 @@ def test_code_of_the_page_runs(block: str, tmp_path: Path) -> None:
 
 
 def test_the_page_has_code() -> None:
-    assert len(PAGE) == 6
+    assert len(PAGE) == 7
 
 
 @pytest.mark.slow
