@@ -20,7 +20,8 @@ from harnack.fields.solids.solid import Solid
 from harnack.tape import pruning
 from harnack.tape.cells import TapeCells
 from harnack.tape.level_box import level_box
-from harnack.tape.pruning import BoxLimits, BoxTapes
+from harnack.tape.operations import COORDINATE_COUNT
+from harnack.tape.pruning import BoxLimits, BoxTapes, PrunedTapes
 from harnack.tape.recording import Tape, record
 from tests.tape.random_models import random_model
 
@@ -419,3 +420,19 @@ def test_numbers_that_overflow_are_not_infinite_in_ranges() -> None:
     one = np.ones((1, 3))
     found = BoxTapes.whole(tape).pruned(one, one, BoxLimits.unlimited(1, ()))
     assert found.low[0] <= math.sqrt(2) * 1e200 <= found.high[0]
+
+
+@pytest.mark.parametrize("scale", [0.9995, 1.0005])
+def test_octants_have_the_members_that_are_as_near_as_their_cap(scale: float) -> None:
+    """A ball and a capsule on the other side of the middle, at the cap from the enlarged octant."""
+    margin, cap, radius = 0.1, 0.3, 0.2
+    x = -scale * (margin + cap) - radius
+    near = hk.Sphere(radius, (x, 0.5, 0.5)), hk.Capsule((x - 1, 0.5, 0.5), (x, 0.5, 0.5), radius)
+    for solid in near:
+        tape = record(hk.union(hk.Sphere(0.1, (0.5, 0.5, 0.5)), solid).formula)
+        lists, limits = BoxTapes.whole(tape), BoxLimits.unlimited(1, ())
+        caps = np.full(len(lists.instructions), cap)
+        whole = PrunedTapes(lists, np.zeros(1), np.zeros(1), limits, caps)
+        lengths = whole.octants(np.zeros((1, 3)), margin).lengths - COORDINATE_COUNT
+        # The last octant is that of large x, y and z.
+        assert lengths[-1] == (2 if scale < 1 else 1)

@@ -132,14 +132,14 @@ def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend
     return other
 
 
-def _attached_number(given: Any, old: Any, backend: Backend) -> Any:
-    """The argument `given` in the form of the attribute `old`, a number, a tuple of numbers or what
-    contains fields."""
-    if isinstance(old, float):
-        return attached_vector(given, [old], backend)[0] if _has_array(given) else old
-    if isinstance(old, tuple) and _has_array(given):
-        return attached_vector(given, cast("Any", old), backend)
-    return attached(old, backend)
+def _attached_number(argument: Any, stored: Any, backend: Backend) -> Any:
+    """An argument of the constructor in the form of `stored`, the attribute that holds it: a
+    number, a tuple of numbers or what contains fields."""
+    if isinstance(stored, float):
+        return attached_vector(argument, [stored], backend)[0] if _has_array(argument) else stored
+    if isinstance(stored, tuple) and _has_array(argument):
+        return attached_vector(argument, cast("Any", stored), backend)
+    return attached(stored, backend)
 
 
 def _has_array(value: Any) -> bool:

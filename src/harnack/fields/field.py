@@ -188,16 +188,14 @@ class Field(FieldOperators, Parametrized, abc.ABC):
                 f"the traits of {cls.__name__} are {describe_type(traits)}: write traits = "
                 "harnack.fields.Traits(...), such as Traits(has_creases=True)"
             )
+        # What was checked when it was made is not searched again.
+        values = _values_without((*args, *kwargs.values()), is_checked)
         if traits.has_parameter_derivatives:
             # They know the derivatives of their own numbers, not those of fields that they are made
             # of.
-            values = _values_without((*args, *kwargs.values()), is_checked)
             check_no_derivatives(cls.__name__, [v for v in values if is_attached(v)])
-        else:
-            # What was checked when it was made is not searched again.
-            values = _values_without((*args, *kwargs.values()), is_checked)
-            if has_derivatives(values):
-                attached = _attached_arguments(cls, args, kwargs)
+        elif has_derivatives(values):
+            attached = _attached_arguments(cls, args, kwargs)
         if cls.evaluate is Field.evaluate:
             raise TypeError(
                 f"{cls.__name__} does not say what its function is: define evaluate(p), which "

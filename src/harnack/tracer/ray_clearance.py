@@ -448,7 +448,7 @@ def _change_of_gradient_norm(
         offset, weight = normal * h, dr.select((inverse > 0) & (h > 0), 0.5 / h, 0)
         gradients = tracer.sample(x - offset).gradient, tracer.sample(x + offset).gradient
         if tracer.field.traits.has_creases:
-            change = fmax(*(max_norm(one - gradient) for one in gradients))
+            change = fmax(*(max_norm(beside - gradient) for beside in gradients))
             weight = dr.select(change * inverse <= _CREASE_CHANGE, weight, 0)
         dr.eval(offset, gradients, weight)
     before, after = (

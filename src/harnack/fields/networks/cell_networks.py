@@ -61,9 +61,9 @@ def networks_of_cells(
     layers: of the network. activation: the function ReLU.
     """
     # Some of the cells tell whether all of them would have too many.
-    some = BoxCells(boxes.corners[:: 1 + len(boxes.corners) // _SOME_CELLS], boxes.size)
-    scale = len(boxes.corners) / max(1, len(some.corners))
-    if _weight_count(ranges_in_boxes(layers, some)) * scale > max_weights:
+    sample = BoxCells(boxes.corners[:: 1 + len(boxes.corners) // _SOME_CELLS], boxes.size)
+    scale = len(boxes.corners) / max(1, len(sample.corners))
+    if _weight_count(ranges_in_boxes(layers, sample)) * scale > max_weights:
         return None
     networks: list[SmallNetwork] = []
     norms = [spectral_bound(matrix) for matrix, _ in layers]
@@ -71,15 +71,15 @@ def networks_of_cells(
         part = BoxCells(boxes.corners[k : k + _CELLS_AT_ONCE], boxes.size)
         ranges = ranges_in_boxes(layers, part)
         values = _Values.of_boxes(part)
-        found: list[list[NetworkLayer]] = [[] for _ in part.corners]
+        layers_of_cells: list[list[NetworkLayer]] = [[] for _ in part.corners]
         for index, layer in enumerate(layers[:-1]):
             active, dead = ranges.is_active[index], ranges.is_dead[index]
             values, rows = values.after(layer, norms[index], active, ~(active | dead))
-            for network, own in zip(found, rows, strict=True):
+            for network, own in zip(layers_of_cells, rows, strict=True):
                 network.append(_layer_of(own, activation, index, len(layers) - 2))
         is_output = np.ones((len(part.corners), 1), np.bool_)
         _, rows = values.after(layers[-1], norms[-1], is_output, is_output)
-        networks += [_with_output(*pair) for pair in zip(found, rows, strict=True)]
+        networks += [_with_output(*pair) for pair in zip(layers_of_cells, rows, strict=True)]
     return networks
 
 

@@ -85,7 +85,7 @@ class SmallNetwork:
         """
         output, output_bias = layers[-1]
         last = len(layers) - 2
-        found = [
+        network_layers = [
             NetworkLayer(
                 weights, bias, activation, output[0] if index == last else np.zeros(len(bias)), 0,
                 0.0, spectral_bound(weights),
@@ -94,7 +94,7 @@ class SmallNetwork:
                 zip(layers[:-1], activations, strict=True)
             )
         ]  # fmt: skip
-        return cls(tuple(found), float(output_bias[0]), 0.0)
+        return cls(tuple(network_layers), float(output_bias[0]), 0.0)
 
 
 @dataclass(frozen=True)

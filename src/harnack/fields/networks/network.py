@@ -299,12 +299,12 @@ class Network(Field):
             is_apart = (boxes.corners - room > upper) | (boxes.corners + boxes.size + room < lower)
             reaches: BoolArray = ~np.any(is_apart, axis=1)
             ranges = ranges_in_boxes(self.layers, boxes.subset(reaches), margin)
-            found = np.ones(len(boxes.corners), np.bool_)
+            has_no_level = np.ones(len(boxes.corners), np.bool_)
             # NaN proves nothing.
-            found[reaches] = np.logical_and.reduce(
+            has_no_level[reaches] = np.logical_and.reduce(
                 [(ranges.lower > level) | (ranges.upper < level) for level in levels]
             )
-            return found
+            return has_no_level
 
         return is_empty
 
