@@ -105,12 +105,12 @@ def test_closed_forms_are_as_sharp_as_the_general_arithmetic() -> None:
     h, u, v = (x * a + y * b + z * c - e for a, b, c, e in rows)
     quick = segment_distance(line, numbers, backend.Float(half))
     slow = norm(u, v, ((abs(h) - backend.Float(half)).pointwise_maximum(h.constant(0.0))))
-    for mine, other in (
+    for closed, general in (
         (quick.value, slow.value),
         (quick.first_derivatives[0], slow.first_derivatives[0]),
         (quick.second_derivatives[0], slow.second_derivatives[0]),
     ):
-        width, general_width = (np.array(e.upper - e.lower) for e in (mine, other))
+        width, general_width = (np.array(e.upper - e.lower) for e in (closed, general))
         assert (width <= general_width * (1 + 1e-6) + 1e-12).mean() > 0.9
 
 

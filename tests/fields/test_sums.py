@@ -166,9 +166,9 @@ def test_a_single_term_takes_as_many_evaluations(field: Field) -> None:
     o, d = rays(5, 200)
     alone = hk.trace(field, o, d)
     for factor in (1.0, -2.5):
-        one = hk.trace(FieldSum([field], [factor]), o, d)
-        np.testing.assert_array_equal(one.is_hit, alone.is_hit)
-        assert one.evaluations.mean() <= 1.02 * alone.evaluations.mean()
+        scaled = hk.trace(FieldSum([field], [factor]), o, d)
+        np.testing.assert_array_equal(scaled.is_hit, alone.is_hit)
+        assert scaled.evaluations.mean() <= 1.02 * alone.evaluations.mean()
 
 
 def test_a_sum_of_harmonic_terms_is_harmonic() -> None:

@@ -379,8 +379,8 @@ def test_ranges_contain_sums_of_products_that_cancel() -> None:
     tape = record(lambda x, y, z: -3.0 * x + 4.95)
     boxes = np.repeat(numbers[:, None], 3, axis=1)
     lists = BoxTapes.whole(tape).subset(np.zeros(400, np.int64))
-    found = lists.pruned(boxes, boxes, BoxLimits.unlimited(400, ()))
-    for number, low, high in zip(numbers.tolist(), found.low, found.high, strict=True):
+    pruned = lists.pruned(boxes, boxes, BoxLimits.unlimited(400, ()))
+    for number, low, high in zip(numbers.tolist(), pruned.low, pruned.high, strict=True):
         assert Fraction(low) <= Fraction(4.95) - 3 * Fraction(number) <= Fraction(high)
 
 
@@ -417,9 +417,9 @@ def test_numbers_that_overflow_are_not_infinite_in_ranges() -> None:
     )
     assert corners is None or corners[1][0] > 1098.0
     tape = record(lambda x, y, z: hk.math.norm(x * 1e200, y * 1e200))
-    one = np.ones((1, 3))
-    found = BoxTapes.whole(tape).pruned(one, one, BoxLimits.unlimited(1, ()))
-    assert found.low[0] <= math.sqrt(2) * 1e200 <= found.high[0]
+    corner = np.ones((1, 3))
+    pruned = BoxTapes.whole(tape).pruned(corner, corner, BoxLimits.unlimited(1, ()))
+    assert pruned.low[0] <= math.sqrt(2) * 1e200 <= pruned.high[0]
 
 
 @pytest.mark.parametrize("scale", [0.9995, 1.0005])

@@ -56,13 +56,13 @@ def differences(e: Callable[[float], np.ndarray], step: float = 1e-4) -> np.ndar
         return (8 * (e(step) - e(-step)) - (e(2 * step) - e(-2 * step))) / (12 * step)
 
 
-def agree(found: Any, expected: np.ndarray, rows: np.ndarray) -> None:
+def agree(measured: Any, expected: np.ndarray, rows: np.ndarray) -> None:
     """Clearances of some rays have the derivatives of differences, and those of others 0."""
-    found = np.array(found)
+    measured = np.array(measured)
     scale = np.abs(expected[rows]).max()
     assert scale > 0
-    np.testing.assert_allclose(found[rows], expected[rows], atol=1e-6 * scale)
-    assert (found[~rows] == 0).all()
+    np.testing.assert_allclose(measured[rows], expected[rows], atol=1e-6 * scale)
+    assert (measured[~rows] == 0).all()
 
 
 # --- values ---------------------------------------------------------------------------------
@@ -91,9 +91,9 @@ def test_clearances_are_the_least_of_dense_samples(name: str) -> None:
     meets = np.isfinite(expected)
     assert np.isfinite(hits.clearance[meets]).all()
     # Never below the least of the ray; and samples in NumPy are 0.002 apart.
-    found, expected = hits.clearance[meets], expected[meets]
-    assert (found <= expected * (1 + 1e-6)).all()
-    assert (found >= expected - 0.06 * expected.clip(0, 0.1)).all()
+    measured, expected = hits.clearance[meets], expected[meets]
+    assert (measured <= expected * (1 + 1e-6)).all()
+    assert (measured >= expected - 0.06 * expected.clip(0, 0.1)).all()
     # It is met at the point that is given.
     away = (hits.clearance > 0) & np.isfinite(hits.clearance)
     offsets = field.value(hits.nearest_point[away])[:, None] - levels
@@ -136,10 +136,10 @@ def test_kinds_of_arrays() -> None:
     assert empty.nearest_point.shape == (0, 3)
     tensor = dr.tensor_t(DOUBLE.Array3f)
     tensors = [tensor(array) for array in (o, d)]
-    found = hk.trace(SPHERE, *tensors, clearance=True)
+    measured = hk.trace(SPHERE, *tensors, clearance=True)
     expected = hk.trace(SPHERE, o, d, clearance=True)
-    assert found.nearest_point.shape == (5, 3)
-    np.testing.assert_array_equal(found.clearance.numpy(), expected.clearance)
+    assert measured.nearest_point.shape == (5, 3)
+    np.testing.assert_array_equal(measured.clearance.numpy(), expected.clearance)
 
 
 def test_what_is_refused_by_name() -> None:
@@ -203,15 +203,15 @@ def test_derivatives_by_levels_and_rays(name: str, moved: str) -> None:
     expected = differences(
         lambda s: clearances(field, o + s * shift[0], d + s * shift[1], level + s * on_level)
     )
-    given = [vector(o), vector(d), DOUBLE.Float(level)]
+    arguments = [vector(o), vector(d), DOUBLE.Float(level)]
     index = ("origin", "direction", "level").index(moved)
-    dr.enable_grad(given[index])
-    dr.set_grad(given[index], 1 if moved == "level" else vector(motion))
-    hits = hk.trace(field, given[0], given[1], level=given[2], clearance=True)
-    found = np.array(dr.forward_to(hits.clearance))
+    dr.enable_grad(arguments[index])
+    dr.set_grad(arguments[index], 1 if moved == "level" else vector(motion))
+    hits = hk.trace(field, arguments[0], arguments[1], level=arguments[2], clearance=True)
+    measured = np.array(dr.forward_to(hits.clearance))
     away = ~np.array(hits.is_hit) & np.isfinite(expected)
     assert away.sum() > 2
-    agree(found, expected, away)
+    agree(measured, expected, away)
 
 
 class _MovedBall(hk.Field):
@@ -239,13 +239,13 @@ class _MovedBall(hk.Field):
 @pytest.mark.slow
 def test_derivatives_by_parameters_include_those_of_the_gradient() -> None:
     o, d = rays(40)
-    found = []
+    measured = []
     for k in range(2):
         numbers = [DOUBLE.Float(0.1), DOUBLE.Float(0.3)]
         dr.enable_grad(numbers[k])
         dr.set_grad(numbers[k], 1)
         hits = hk.trace(_MovedBall(*numbers), vector(o), vector(d), clearance=True)
-        found.append(np.array(dr.forward_to(hits.clearance)))
+        measured.append(np.array(dr.forward_to(hits.clearance)))
     misses = ~np.array(hits.is_hit)
     for k, (dx, dtilt) in enumerate([(1, 0), (0, 1)]):
         expected = differences(
@@ -253,7 +253,7 @@ def test_derivatives_by_parameters_include_those_of_the_gradient() -> None:
                 _MovedBall(0.1 + s * dx, 0.3 + s * dtilt), o, d, 0.0
             )
         )
-        agree(found[k], expected, misses)
+        agree(measured[k], expected, misses)
 
 
 @pytest.mark.slow
