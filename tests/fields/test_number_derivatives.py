@@ -54,6 +54,14 @@ OTHERS: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {
             & hk.Sphere(0.9).translated((0.1, 0.0, 0.0)).scaled(factor)
         ),
     ),
+    "a sum and a product": (
+        {"a": 1.3, "r": 0.7, "w": 0.4},
+        lambda a, r, w: (
+            hk.expression("a*x^2 + y^2 + z^2 - 0.7", a=a) * hk.expression("b + 0.1*x", b=r)
+            + hk.SphericalHarmonic(2, 1) * w
+            + hk.expression("c*z", c=a) / 5
+        ),
+    ),
     "a formula": (
         {"a": 1.3, "b": 0.4},
         lambda a, b: hk.expression(
@@ -155,7 +163,6 @@ def test_numbers_that_would_be_lost_are_refused() -> None:
         lambda: hk.Sphere(r).twisted(10),
         lambda: hk.Sphere(r).shell(0.1),
         lambda: hk.solids.struts([[0, 0, 0], [1, 0, 0]], [[0, 1]], r),
-        lambda: hk.fields.FieldSum([hk.Sphere(r), hk.Sphere(1.0)], [1, 1]),
         lambda: hk.expression(lambda x, y, z: x - r),
         lambda: hk.expression("x - a", a=Learned(0.5)),
         lambda: hk.Sphere(Learned(0.5)),
@@ -189,13 +196,14 @@ def test_normals_move_with_rays_and_levels() -> None:
     np.testing.assert_allclose(dr.grad(level), [-0.3], atol=1e-9)
 
 
-def test_normals_by_weights_are_refused() -> None:
+def test_normals_move_with_weights() -> None:
     weight = Float64(2.0)
     dr.enable_grad(weight)
-    surface = hk.expression("x^2 + y^2 - z") * weight
+    # The normal is (2 w x, 0, -1), normalized.
+    surface = hk.expression("x^2 + y^2") * weight - hk.expression("z")
     hits = hk.trace(surface, Array3f64(0.3, 0.0, 3.0), Array3f64(0, 0, -1), level=0.1)
-    with pytest.raises(Exception, match="normal of hits cannot be differentiated"):
-        dr.backward(hits.normal.x)
+    dr.backward(hits.normal.x)
+    np.testing.assert_allclose(dr.grad(weight), [0.6 / (1 + 1.2**2) ** 1.5], atol=1e-9)
 
 
 def test_other_numbers_compile_nothing() -> None:

@@ -70,15 +70,17 @@ def _beside(p: Vec3) -> Vec3:
 
 def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 | None:
     """The gradient at p as an expression that Dr.Jit can differentiate with respect to p and to the
-    parameters of a field (`Traits.differentiable_arguments`); None if the field has no formula for
-    that. At ties of a maximum or minimum it is that of one side. evaluator: that of the field."""
+    parameters of a field; None where that is not known. At ties of a maximum or minimum it is that
+    of one side. evaluator: that of the field."""
     formula: Any = getattr(evaluator, "formula", None)
     if ATTACHED in vars(field):
         formula = _formula_of_attached(field, p)
-    elif formula is None or getattr(evaluator, "uploaded", None) is not None:
-        return None  # a recorded loop runs the instructions of a long formula
     elif any(map(dr.grad_enabled, differentiable_parameters(field))):
-        return None  # such as weights of a sum, which are no numbers of its formula
+        default = Evaluator.differentiable_gradient  # it knows no parameters
+        is_known = type(evaluator).differentiable_gradient is not default
+        return evaluator.differentiable_gradient(p) if is_known else None
+    elif formula is None or getattr(evaluator, "uploaded", None) is not None:
+        return evaluator.differentiable_gradient(p)  # a loop runs the steps of a long formula
     coordinates = Dual.at_point(_beside(p))
     try:
         result = coordinates[0].coerce(formula(*coordinates))

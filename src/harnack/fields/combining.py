@@ -3,6 +3,7 @@ formulas again (`FormulaSum`, `FormulaProduct`)."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
@@ -139,6 +140,8 @@ class FormulaSum(Formula):
         TypeError, ValueError: a number that is not finite.
     """
 
+    traits = dataclasses.replace(Formula.traits, differentiable_arguments=("terms",))
+
     terms: tuple[Field, ...]
     weights: tuple[float, ...]
     constant: float = 0.0
@@ -154,7 +157,10 @@ class FormulaSum(Formula):
             ("constant", as_finite(self.constant, "constant")),
             ("domain", common_domain(self.terms)),
             ("default_level", float(np.dot(weights, levels))),
-            ("traits", common_traits(self.terms)),
+            (
+                "traits",
+                dataclasses.replace(common_traits(self.terms), differentiable_arguments=("terms",)),
+            ),
             (
                 "lipschitz",
                 None if None in constants else float(np.dot(np.abs(weights), constants)),
@@ -192,12 +198,17 @@ class FormulaProduct(Formula):
     factors: the two formulas.
     """
 
+    traits = dataclasses.replace(Formula.traits, differentiable_arguments=("factors",))
+
     factors: tuple[Field, Field]
 
     def __post_init__(self) -> None:
         """Set what follows from the factors: the domain and the traits."""
         object.__setattr__(self, "domain", common_domain(self.factors))
-        object.__setattr__(self, "traits", common_traits(self.factors))
+        traits = dataclasses.replace(
+            common_traits(self.factors), differentiable_arguments=("factors",)
+        )
+        object.__setattr__(self, "traits", traits)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """A volume that contains the level sets, as of `FieldProduct`; or the box of a formula that

@@ -126,6 +126,22 @@ class Evaluator(abc.ABC):
             'ask for what needs none, such as signed_distance(..., method="first_order")'
         )
 
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        """grad f at p as an expression that Dr.Jit can differentiate with respect to p and to the
+        parameters of the field; None where that is not known, so that derivatives of gradients and
+        normals are refused. The default knows p alone, by `hessian`: a class whose
+        `differentiable_value` has derivatives by parameters overrides both."""
+        with dr.suspend_grad():
+            point = dr.detach(p)
+            try:
+                rows = self.hessian(point)
+            except NotImplementedError:
+                return None
+            gradient = self.evaluate(point).gradient
+        # `moved` is 0, and its derivative is that of p.
+        moved = p - point
+        return gradient + type(p)(*(dr.dot(row, moved) for row in rows))
+
     def derivative_errors(self, p: Vec3, sample: Sample) -> tuple[Real, Real]:
         """Two error bounds at the point p of a sample: of the gradient, as a length, and of
         `hessian`, in the spectral norm. The default for the gradient is the sample's

@@ -191,9 +191,10 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         # What was checked when it was made is not searched again.
         values = _values_without((*args, *kwargs.values()), is_checked)
         if traits.has_parameter_derivatives:
-            # They know the derivatives of their own numbers, not those of fields that they are made
-            # of.
-            check_no_derivatives(cls.__name__, [v for v in values if is_attached(v)])
+            # They know the derivatives of their own numbers; those of fields that they are made of,
+            # only sums and products do.
+            if not traits.differentiable_arguments:
+                check_no_derivatives(cls.__name__, [v for v in values if is_attached(v)])
         elif has_derivatives(values):
             attached = _attached_arguments(cls, args, kwargs)
         if cls.evaluate is Field.evaluate:
@@ -363,20 +364,14 @@ class Field(FieldOperators, Parametrized, abc.ABC):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         refuse_hidden_parameters(self)
         parameters = differentiable_parameters(self)
-        if ATTACHED in vars(self) and any(map(dr.grad_enabled, parameters)):
-            gradient = gradient_with_parameters(self, self.evaluator(backend_of(points)), points)
-            if gradient is not None:
-                return gradient
-        check_no_derivatives(f"the gradient of {type(self).__name__}", parameters)
-        if not dr.grad_enabled(points):
+        if not any(map(dr.grad_enabled, (points, *parameters))):
             return self.evaluate(points).gradient
-        with dr.suspend_grad():
-            p = dr.detach(points)
-            gradient, rows = self.evaluate(p).gradient, self.hessian(p)
-        # `p` is the points without derivatives. So `moved` is 0 and has the derivative 1 by the
-        # points: the value of the result is the gradient, and its derivative is the Hessian.
-        moved = points - p
-        return gradient + type(points)(*(dr.dot(row, moved) for row in rows))
+        evaluator = self.evaluator(backend_of(points))
+        gradient = gradient_with_parameters(self, evaluator, points)
+        if gradient is None:
+            check_no_derivatives(f"the gradient of {type(self).__name__}", parameters)
+            evaluator.hessian(dr.detach(points))  # says that it is not known
+        return gradient
 
     def _evaluate_points(
         self, points: Any, precision: Precision | None, choose: Callable[[Sample], Any]

@@ -21,6 +21,7 @@ from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.products import product_sample
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.enclosures.sums import shared_reach, value_error
+from harnack.fields.attached_numbers import gradient_with_parameters, value_with_parameters
 from harnack.fields.capabilities import Boundary, VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
@@ -55,7 +56,7 @@ class FieldProduct(Field):
             union of patches.
     """
 
-    traits = Traits(has_parameter_derivatives=True)
+    traits = Traits(has_parameter_derivatives=True, differentiable_arguments=("factors",))
 
     def __init__(self, factors: Iterable[Field]) -> None:
         """Check the factors, and set what follows from them: the domain and the traits."""
@@ -77,7 +78,9 @@ class FieldProduct(Field):
                 )
         self.domain = common_domain(self.factors)
         traits = common_traits(self.factors)
-        self.traits = dataclasses.replace(traits, has_parameter_derivatives=True)
+        self.traits = dataclasses.replace(
+            traits, has_parameter_derivatives=True, differentiable_arguments=("factors",)
+        )
 
     @property
     def boundary(self) -> Boundary | None:
@@ -104,7 +107,7 @@ class FieldProduct(Field):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> ProductEvaluator:
         inner = Plan(ray_count=plan.ray_count)
         first, second = (factor.evaluator(backend, inner) for factor in self.factors)
-        return ProductEvaluator(first, second)
+        return ProductEvaluator(self.factors, first, second)
 
 
 def extent_of_product(
@@ -133,9 +136,11 @@ def _zero_extent(factor: Field) -> Volume | None:
 class ProductEvaluator(Evaluator):
     """The evaluator of a product of two fields, its factors.
 
-    first, second: the evaluators of the factors.
+    factors: the factors.
+    first, second: their evaluators.
     """
 
+    factors: tuple[Field, ...]
     first: Evaluator
     second: Evaluator
 
@@ -161,7 +166,8 @@ class ProductEvaluator(Evaluator):
         def at(scale: Real) -> Evaluator:
             """The product, with its factors sampled at this accuracy scale."""
             pairs = zip(factors, accuracies, strict=True)
-            return ProductEvaluator(*(f if a is None else a.at(scale) for f, a in pairs))
+            first, second = (f if a is None else a.at(scale) for f, a in pairs)
+            return ProductEvaluator(self.factors, first, second)
 
         return VariableAccuracy(at, min(a.coarsest for a in known)) if known else None
 
@@ -254,4 +260,17 @@ class ProductEvaluator(Evaluator):
         return bound * (1 + 1e-5)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        return self.first.differentiable_value(p) * self.second.differentiable_value(p)
+        f, g = (value_with_parameters(factor, e, p) for factor, e in self._pairs)
+        return f * g
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        gradients = [gradient_with_parameters(factor, e, p) for factor, e in self._pairs]
+        if gradients[0] is None or gradients[1] is None:
+            return None
+        f, g = (value_with_parameters(factor, e, p) for factor, e in self._pairs)
+        return f * gradients[1] + g * gradients[0]
+
+    @property
+    def _pairs(self) -> tuple[tuple[Field, Evaluator], ...]:
+        """The factors with their evaluators."""
+        return (self.factors[0], self.first), (self.factors[1], self.second)

@@ -30,6 +30,7 @@ from harnack.enclosures.parabola_arithmetic import (
 )
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.enclosures.sums import shared_reach, summed_sample, weighted_sample
+from harnack.fields.attached_numbers import gradient_with_parameters, value_with_parameters
 from harnack.fields.capabilities import Boundary, Jumps, VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
@@ -87,7 +88,7 @@ class FieldSum(Field):
             across facets; a term that is a union of patches.
     """
 
-    traits = Traits(has_parameter_derivatives=True)
+    traits = Traits(has_parameter_derivatives=True, differentiable_arguments=("terms",))
 
     def __init__(
         self, terms: Field | Iterable[Field], weights: Any = None, constant: Any = 0.0
@@ -129,6 +130,7 @@ class FieldSum(Field):
                 term.traits.is_larger_inside == (weight > 0) for term, weight in pairs
             ),
             has_parameter_derivatives=True,
+            differentiable_arguments=type(self).traits.differentiable_arguments,
         )
 
     @property
@@ -195,6 +197,7 @@ class FieldSum(Field):
         moved = device_numbers(self.weights, backend, len(self.terms))
         terms = tuple(
             _Term(
+                term,
                 term.evaluator(backend, inner_plan),
                 dr.opaque(backend.Float, number),
                 number,
@@ -211,13 +214,14 @@ class FieldSum(Field):
 class _Term:
     """A term of a sum on a backend.
 
-    evaluator: the evaluator of the field f.
+    field: the field f, and evaluator: its evaluator.
     weight: its weight, a kernel parameter without derivatives.
     number: the same as a Python number.
     moved_weight: the weight as it was given if it is a Dr.Jit number, which may have derivatives;
         else None.
     """
 
+    field: Field
     evaluator: Evaluator
     weight: Real
     number: float
@@ -245,7 +249,14 @@ class _Term:
     def differentiable_value(self, p: Vec3) -> Real:
         """weight * f at p, with derivatives with respect to p, the weight and parameters of f."""
         weight = self.weight if self.moved_weight is None else self.moved_weight
-        return weight * self.evaluator.differentiable_value(p)
+        return weight * value_with_parameters(self.field, self.evaluator, p)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        """The gradient of weight * f at p, with derivatives with respect to p, the weight and
+        parameters of f; None where that of f is not known."""
+        gradient = gradient_with_parameters(self.field, self.evaluator, p)
+        weight = self.weight if self.moved_weight is None else self.moved_weight
+        return None if gradient is None else weight * gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,3 +437,13 @@ class SumEvaluator(Evaluator):
             if term.number != 0 or term.moved_weight is not None:
                 value = value + term.differentiable_value(p)
         return value
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        total = 0 * p
+        for term in self.terms:
+            if term.number != 0 or term.moved_weight is not None:
+                gradient = term.differentiable_gradient(p)
+                if gradient is None:
+                    return None
+                total = total + gradient
+        return total
