@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 # The keywords of `trace`.
 _HONORED = ("level", "clip", "section", "largest", *TRACE_OPTIONS)
 # With at least this many rays it pays to search for empty cells first.
-_MIN_RAYS_FOR_CELLS = 4096
+MIN_RAYS_FOR_CELLS = 4096
 # Rays are scattered if the directions of successive rays differ by more than the first number, or
 # their origins by more than the second number times the spread of all origins (both as roots of
 # mean squares), measured on the third number of rays.
@@ -293,10 +293,24 @@ def _trace(surface: TracedSurface, rays: RayBatch, *, measures_clearance: bool) 
 
     measures_clearance: whether the result is a `ClearanceHits`.
     """
-    backend, o, d, count = rays.backend, rays.origin, rays.direction, rays.count
-    tracer = surface.for_rays(count).tracer(backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
-    if not tracer.field.traits.is_cheap and _are_scattered(backend, dr.detach(o), dr.detach(d)):
+    count = rays.count
+    tracer = surface.for_rays(count).tracer(rays.backend, many_rays=count >= MIN_RAYS_FOR_CELLS)
+    if not tracer.field.traits.is_cheap and _are_scattered(
+        rays.backend, dr.detach(rays.origin), dr.detach(rays.direction)
+    ):
         tracer = replace(tracer, uses_ray_queue=True)
+    hits, has_derivatives = hits_with_derivatives(tracer, rays)
+    if measures_clearance:
+        hits = _with_clearance(surface, tracer, rays, hits, has_derivatives=has_derivatives)
+    dr.eval(*vars(hits).values())
+    return hits
+
+
+def hits_with_derivatives(tracer: SurfaceTracer, rays: RayBatch) -> tuple[Hits, bool]:
+    """Return the first hits of rays with a surface, as Dr.Jit arrays, and whether they carry
+    derivatives: if the rays were given as Dr.Jit arrays, and rays, levels or field have derivatives
+    enabled."""
+    o, d = rays.origin, rays.direction
     # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
         end, hits, doubt = _first_hits(tracer, *(dr.detach(array) for array in rays.arrays))
@@ -314,10 +328,7 @@ def _trace(surface: TracedSurface, rays: RayBatch, *, measures_clearance: bool) 
         hits = replace(
             hits, t=t, position=position, normal=normal, value=value, uncertainty=uncertainty
         )
-    if measures_clearance:
-        hits = _with_clearance(surface, tracer, rays, hits, has_derivatives=has_derivatives)
-    dr.eval(*vars(hits).values())
-    return hits
+    return hits, has_derivatives
 
 
 def _with_clearance(
@@ -354,7 +365,7 @@ def _are_scattered(backend: Backend, o: Vec3, d: Vec3) -> bool:
     take half the time with a queue; a camera's rays take a fifth more.
     """
     count = dr.width(o, d)
-    if count < _MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
+    if count < MIN_RAYS_FOR_CELLS or dr.backend_v(d) != dr.JitBackend.LLVM:
         return False
     # Compare about 4096 rays with their successors. (An opaque step compiles no new kernel if it
     # changes.)
@@ -539,7 +550,7 @@ def _trace_on_device(surface: TracedSurface, rays: RayBatch) -> Hits:
     from harnack.webgpu import evaluate_on_device, find_device  # imported here: few need it
 
     count = rays.count
-    tracer = surface.tracer(rays.backend, many_rays=count >= _MIN_RAYS_FOR_CELLS)
+    tracer = surface.tracer(rays.backend, many_rays=count >= MIN_RAYS_FOR_CELLS)
     # A device needs every array at full width: single numbers are repeated for each ray.
     lanes = {
         name: array + dr.zeros(type(array), count)

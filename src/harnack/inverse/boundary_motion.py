@@ -1,0 +1,215 @@
+"""How the boundaries of what a picture shows move on the screen when f, the function of the field,
+changes. A boundary is a curve on the screen at which the picture jumps. At a point x of the surface
+that is seen on the boundary, all that is needed is the change of f at fixed points of space, and
+gradients.
+
+Let J be the derivative of the screen point by x, and n the unit normal of the boundary on the
+screen, so that its normal velocity is v = n . J dx for a motion dx of x that keeps x on the
+boundary. It does not matter which: motions along the boundary have n . J dx = 0.
+
+- Outline: the ray touches the surface. It lies in the tangent plane, hence J g is a multiple of n,
+  where g = grad f. Every motion that keeps f = level at x has g . dx = -df, where df is the change
+  of f at fixed x minus that of the level; so dx = -df g/|g|^2 does. (That the point of contact also
+  moves along the ray changes nothing: J maps this to 0.)
+- Crease: two smooth parts of the surface meet, with gradients g1 and g2 on both sides. The point
+  stays on both, g1 . dx = -df1 and g2 . dx = -df2, and n is normal to the image of g1 x g2.
+- Cut: a clip volume with the unit normal g2 ends the surface. The same, with df2 = 0.
+- End: a level set of an angle ends at the curve around which the angle is. At a distance r, f
+  changes by grad f ~ 1/r when the curve moves, and by O(1) for all other reasons. So at two points
+  at the distance r from the curve's point, in directions that differ by 90 degrees, g1 . dx = -df1
+  and g2 . dx = -df2 up to a relative error of the order of r, for the motion dx of the curve; r is
+  a millionth of the size of the surface.
+
+With the rows g_k of a matrix G, the shortest such motion is dx = -G^T (G G^T)^-1 df; so v is a
+weighted sum of the numbers df_k, with weights that are constants of the derivative."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from harnack.backend.arrays import to_numpy, upload_vectors
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, IntArray
+    from harnack.geometry import Volume
+    from harnack.inverse.discontinuities import Discontinuities
+    from harnack.inverse.film import Film
+    from harnack.tracer.surface_tracer import SurfaceTracer
+
+# The surface is the same on both sides of a jump if positions differ by less than this part of the
+# width of a pixel. Cuts and ends are recognized within the same distance.
+_SAME_POINT = 1e-4
+# A ray touches the surface if the sine of the angle between them is below this number: bisection
+# leaves it at about 1e-3.
+_TOUCHING = 0.02
+# Two gradients are parallel if the squared sine of their angle is below this number.
+_PARALLEL = 1e-10
+# The distance from a curve at which f is sampled, as a part of the size of coordinates there.
+_BESIDE_CURVE = 1e-6
+
+
+class BoundaryKind(IntEnum):
+    """Why a picture jumps at a point."""
+
+    OUTLINE = 0
+    CREASE = 1
+    CUT = 2
+    END = 3
+    UNKNOWN = 4
+
+
+@dataclass(frozen=True)
+class BoundaryMotion:
+    """The motion of n points of boundaries as weighted sums of changes of f.
+
+    kind: (n,) a `BoundaryKind` for each point.
+    normal: (n, 2) the unit normal on the screen, which points from before the jump to behind it; 0
+        for unknown kinds.
+    index: (k,) the point to which each term of the sums belongs.
+    position: (k, 3) where the change of f is taken.
+    weight: (k,) its weight.
+    """
+
+    kind: IntArray
+    normal: FloatArray
+    index: IntArray
+    position: FloatArray
+    weight: FloatArray
+
+
+def boundary_motion(
+    jumps: Discontinuities, film: Film, tracer: SurfaceTracer, cut: Volume | None
+) -> BoundaryMotion:
+    """Tell how the points at which a picture jumps move.
+
+    jumps: the points, with what is seen on both sides.
+    tracer: the surface, in the double precision in which the points were found.
+    cut: the volume that cuts the surface; None if nothing does.
+    """
+    before, behind = jumps.before, jumps.behind
+    is_front = before.t <= behind.t
+    x = np.where(is_front[:, None], before.position, behind.position)
+    other = np.where(is_front[:, None], behind.position, before.position)
+    middle = jumps.screen.mean(axis=1)
+    width = film.pixel_width(x)
+    g = _gradients(tracer, x)
+    # What the boundary needs of a second function; 0 where there is none.
+    second, second_position = np.zeros_like(g), x.copy()
+    first_position = x.copy()
+    kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
+    is_left = np.ones(len(x), bool)
+
+    def take(which: FloatArray, value: BoundaryKind) -> IntArray:
+        """Give points that have no kind yet this one; returns their indices."""
+        index = np.flatnonzero(is_left & which)
+        kind[index], is_left[index] = int(value), False
+        return index
+
+    both = before.is_hit & behind.is_hit
+    with np.errstate(invalid="ignore"):
+        is_near = both & (np.linalg.norm(x - other, axis=1) < _SAME_POINT * width)
+    if (index := take(is_near, BoundaryKind.CREASE)).size:
+        second[index], second_position[index] = _gradients(tracer, other[index]), other[index]
+    ends = _near_curve(tracer, x, width)
+    if ends is not None and (index := take(ends[0], BoundaryKind.END)).size:
+        sides = _beside_curve(tracer, x[index], ends[1][index], g[index])
+        first_position[index], g[index], second_position[index], second[index] = sides
+    if cut is not None:
+        point = upload_vectors(tracer.backend, x)
+        depth = to_numpy(cut.signed_distance(point))
+        if (index := take(np.abs(depth) < _SAME_POINT * width, BoundaryKind.CUT)).size:
+            point = upload_vectors(tracer.backend, x[index])
+            second[index] = to_numpy(cut.outward_normal(point)).reshape(-1, 3)
+    directions = film.directions(middle)
+    sine = np.abs((g * directions).sum(axis=1)) / np.linalg.norm(g, axis=1)
+    take(sine < _TOUCHING, BoundaryKind.OUTLINE)
+    return _solved(jumps, film, kind, x, (g, second), (first_position, second_position))
+
+
+def _solved(
+    jumps: Discontinuities, film: Film, kind: IntArray, x: FloatArray,
+    gradients: tuple[FloatArray, FloatArray], positions: tuple[FloatArray, FloatArray],
+) -> BoundaryMotion:  # fmt: skip
+    """The motion of points x (n, 3) of these kinds, from the gradients (n, 3) of one or two
+    functions and the positions (n, 3) at which their changes are taken."""
+    g1, g2 = gradients
+    jacobian = film.jacobian(x)
+    is_pair = (kind != int(BoundaryKind.OUTLINE)) & (kind != int(BoundaryKind.UNKNOWN))
+    squares, mixed, others = (np.einsum("ni,ni->n", a, b) for a, b in ((g1, g1), (g1, g2), (g2, g2)))
+    determinant = squares * others - mixed**2
+    is_parallel = is_pair & ~(determinant > _PARALLEL * squares * others)
+    kind = np.where(is_parallel, int(BoundaryKind.UNKNOWN), kind)
+    is_pair &= ~is_parallel
+    is_single = kind == int(BoundaryKind.OUTLINE)
+    along = np.einsum("nsi,ni->ns", jacobian, np.cross(g1, g2))
+    normal = np.where(
+        is_pair[:, None],
+        np.stack([-along[:, 1], along[:, 0]], axis=1),
+        np.einsum("nsi,ni->ns", jacobian, g1),
+    )
+    length = np.linalg.norm(normal, axis=1)
+    is_known = (is_pair | is_single) & (length > 0)
+    kind = np.where(is_known, kind, int(BoundaryKind.UNKNOWN))
+    towards = np.diff(jumps.screen, axis=1)[:, 0]
+    side = np.where((normal * towards).sum(axis=1) < 0, -1.0, 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normal = np.where(is_known[:, None], normal * (side / length)[:, None], 0)
+        pulled = np.einsum("ns,nsi->ni", normal, jacobian)
+        first, second = (np.einsum("ni,ni->n", pulled, g) for g in (g1, g2))
+        # The row pulled . G^T (G G^T)^-1, with a minus; for a single row, of g1 alone.
+        weight1 = np.where(
+            is_pair, -(first * others - second * mixed) / determinant, -first / squares
+        )
+        weight2 = np.where(is_pair, -(second * squares - first * mixed) / determinant, 0)
+    has_second = is_known & ((kind == int(BoundaryKind.CREASE)) | (kind == int(BoundaryKind.END)))
+    known, pairs = np.flatnonzero(is_known), np.flatnonzero(has_second)
+    return BoundaryMotion(
+        kind,
+        normal,
+        np.concatenate([known, pairs]),
+        np.concatenate([positions[0][known], positions[1][pairs]]),
+        np.concatenate([weight1[known], weight2[pairs]]),
+    )
+
+
+def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
+    """grad f at points (n, 3)."""
+    if not len(points):
+        return np.zeros((0, 3))
+    sample = tracer.sample(upload_vectors(tracer.backend, points))
+    return to_numpy(sample.gradient).reshape(-1, 3)
+
+
+def _near_curve(
+    tracer: SurfaceTracer, x: FloatArray, width: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Whether points x (n, 3) lie at the curves at which all level sets end, and the closest points
+    (n, 3) of these; None if there are no such curves. width: (n,) the width of a pixel there."""
+    boundary = tracer.field.boundary
+    if boundary is None or boundary.closest_point is None or not len(x):
+        return None
+    closest = boundary.closest_point(upload_vectors(tracer.backend, x))
+    curve = to_numpy(closest).reshape(-1, 3)
+    return np.linalg.norm(x - curve, axis=1) < _SAME_POINT * width, curve
+
+
+def _beside_curve(
+    tracer: SurfaceTracer, x: FloatArray, curve: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Two points (n, 3) beside each point of a curve, in directions that are normal to the curve
+    and to each other, and grad f at both: position, gradient, position, gradient.
+
+    x, g: (n, 3) points near the points of the curve, and grad f there, which is nearly normal to
+        the curve and to the direction away from it.
+    """
+    radius = _BESIDE_CURVE * np.maximum(np.abs(x).max(axis=1, keepdims=True), 1e-30)
+    away = x - curve
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
+    around = g - (g * away).sum(axis=1, keepdims=True) * away
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    first, second = curve + radius * away, curve + radius * around
+    return first, _gradients(tracer, first), second, _gradients(tracer, second)

@@ -1,0 +1,115 @@
+"""What a picture shows of first hits: functions from hits to a few numbers, the channels, for each
+ray."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend.validation import as_real
+from harnack.geometry.volume import as_point
+from harnack.name_suggestions import did_you_mean, with_article
+
+if TYPE_CHECKING:
+    from harnack.backend import FloatArray, Real, Vec3
+    from harnack.inverse.film import Film
+    from harnack.tracer import Hits
+
+Show = Literal["shaded", "normals", "depth", "mask"]
+Channels = Callable[["Hits"], Sequence["Real"]]
+# The part of the light of a shaded picture that comes from all sides.
+_AMBIENT = 0.2
+
+
+@dataclass(frozen=True)
+class ChannelFunction:
+    """The channels of a picture.
+
+    function: from hits to the channels.
+    background: the numbers of the channels where nothing is hit; a single one for all.
+    """
+
+    function: Channels
+    background: tuple[float, ...]
+
+    def of(self, hits: Hits, direction: Vec3) -> list[Real]:
+        """The channels of rays, as Dr.Jit arrays. Where nothing is hit they are the background, and
+        have no derivative. direction: (3,) the directions of the rays."""
+        is_hit = hits.is_hit
+        # Rays without a hit have infinite t, and their derivatives would be NaN.
+        normal = dr.select(is_hit, hits.normal, -direction)
+        hits = replace(
+            hits,
+            t=dr.select(is_hit, hits.t, 1),
+            position=dr.select(is_hit, hits.position, direction),
+            normal=normal * dr.select(dr.dot(dr.detach(normal), direction) > 0, -1, 1),
+        )
+        shown: Any = self.function(hits)
+        kind = cast("Any", type(hits.t))
+        if dr.is_array_v(type(shown)):
+            shown = [*shown] if dr.depth_v(type(shown)) > 1 else [shown]
+        values = [kind(value) for value in shown]
+        background = self.background * (len(values) if len(self.background) == 1 else 1)
+        if len(background) != len(values):
+            raise ValueError(
+                f"background has {len(background)} numbers, and the picture {len(values)} channels"
+            )
+        return [dr.select(is_hit, v, b) for v, b in zip(values, background, strict=True)]
+
+
+def channel_function(show: Any, background: Any, light: Any, film: Film) -> ChannelFunction:
+    """The channels of a picture from the arguments of `picture`.
+
+    Raises:
+        TypeError, ValueError: a name that is none of `Show`, or arguments that are no numbers.
+    """
+    numbers = np.ravel(cast("Any", background)).tolist()
+    colors = tuple(as_real(number, "background") for number in numbers)
+    if callable(show):
+        return ChannelFunction(cast("Any", show), colors)
+    if not isinstance(show, str):
+        kind = with_article(type(show).__name__)
+        raise TypeError(f"show is a name or a function of hits, not {kind}")
+    if show == "shaded":
+        return ChannelFunction(lit_by(_light_direction(light, film)), colors)
+    functions: dict[str, Channels] = {
+        "normals": lambda hits: [*hits.normal],
+        "depth": lambda hits: [hits.t],
+        "mask": lambda hits: [0 * dr.detach(hits.t) + 1],
+    }
+    if show not in functions:
+        names = ("shaded", *functions)
+        raise ValueError(
+            f"show is one of {', '.join(names)}, not {show!r}{did_you_mean(show, names)}"
+        )
+    return ChannelFunction(functions[show], colors)
+
+
+def lit_by(light: FloatArray) -> Channels:
+    """The brightness of a matt white surface in light from a direction (3,), with a fifth of it
+    from all sides."""
+
+    def brightness(hits: Hits) -> list[Real]:
+        """0.2 + 0.8 max(n . l, 0), with the unit normal n and the direction l."""
+        cosine = hits.normal.x * light[0] + hits.normal.y * light[1] + hits.normal.z * light[2]
+        return [_AMBIENT + (1 - _AMBIENT) * dr.maximum(cosine, 0)]
+
+    return brightness
+
+
+def _light_direction(light: Any, film: Film) -> FloatArray:
+    """The unit direction (3,) to the light; by default from above the left shoulder of the camera.
+    light: three numbers, or None."""
+    if light is None:
+        right, up = (axis / np.linalg.norm(axis) for axis in (film.right, film.up))
+        vector = 0.6 * up - 0.4 * right - film.forward
+    else:
+        vector = np.array(as_point(light, "light"))
+    length = np.linalg.norm(vector)
+    if not length > 0:
+        raise ValueError("light must be a direction, not (0, 0, 0)")
+    return vector / length
