@@ -13,6 +13,8 @@ boundary. It does not matter which: motions along the boundary have n . J dx = 0
   moves along the ray changes nothing: J maps this to 0.)
 - Crease: two smooth parts of the surface meet, with gradients g1 and g2 on both sides. The point
   stays on both, g1 . dx = -df1 and g2 . dx = -df2, and n is normal to the image of g1 x g2.
+- Edge: the outline of a solid along a crease. The second surface is that of the side that is
+  turned away: where a ray that passes a little farther inside leaves the solid again.
 - Cut: a clip volume with the unit normal g2 ends the surface. The same, with df2 = 0.
 - End: a level set of an angle ends at the curve around which the angle is. At a distance r, f
   changes by grad f ~ 1/r when the curve moves, and by O(1) for all other reasons. So at two points
@@ -32,13 +34,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend.arrays import to_numpy, upload_vectors
+from harnack.tracer.ray_crossings import crossings_to_numpy, trace_crossings
+from harnack.tracer.rays import RayBatch
+from harnack.tracer.surface import intersection_of
 
 if TYPE_CHECKING:
-    from harnack.backend import FloatArray, IntArray
-    from harnack.geometry import Volume
+    from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.inverse.discontinuities import Discontinuities
     from harnack.inverse.film import Film
     from harnack.tracer.surface_tracer import SurfaceTracer
+    from harnack.tracer.traced_surface import TracedSurface
 
 # The surface is the same on both sides of a jump if positions differ by less than this part of the
 # width of a pixel. Cuts and ends are recognized within the same distance.
@@ -46,6 +51,9 @@ _SAME_POINT = 1e-4
 # A ray touches the surface if the sine of the angle between them is below this number: bisection
 # leaves it at about 1e-3.
 _TOUCHING = 0.02
+# Rays on both sides of an edge pass this part of a pixel inside of it, and the two crossings of such
+# a ray are at most this part of the width of a pixel from the edge.
+_INSIDE, _LONGEST_EDGE = 1e-4, 0.1
 # Two gradients are parallel if the squared sine of their angle is below this number.
 _PARALLEL = 1e-10
 # The distance from a curve at which f is sampled, as a part of the size of coordinates there.
@@ -57,9 +65,10 @@ class BoundaryKind(IntEnum):
 
     OUTLINE = 0
     CREASE = 1
-    CUT = 2
-    END = 3
-    UNKNOWN = 4
+    EDGE = 2
+    CUT = 3
+    END = 4
+    UNKNOWN = 5
 
 
 @dataclass(frozen=True)
@@ -82,13 +91,13 @@ class BoundaryMotion:
 
 
 def boundary_motion(
-    jumps: Discontinuities, film: Film, tracer: SurfaceTracer, cut: Volume | None
+    jumps: Discontinuities, film: Film, surface: TracedSurface, tracer: SurfaceTracer
 ) -> BoundaryMotion:
     """Tell how the points at which a picture jumps move.
 
     jumps: the points, with what is seen on both sides.
-    tracer: the surface, in the double precision in which the points were found.
-    cut: the volume that cuts the surface; None if nothing does.
+    surface, tracer: the surface, and its tracer in the double precision in which the points were
+        found.
     """
     before, behind = jumps.before, jumps.behind
     is_front = before.t <= behind.t
@@ -118,6 +127,7 @@ def boundary_motion(
     if ends is not None and (index := take(ends[0], BoundaryKind.END)).size:
         sides = _beside_curve(tracer, x[index], ends[1][index], g[index])
         first_position[index], g[index], second_position[index], second[index] = sides
+    cut = intersection_of([surface.field.domain, surface.clip_volume])
     if cut is not None:
         point = upload_vectors(tracer.backend, x)
         depth = to_numpy(cut.signed_distance(point))
@@ -127,6 +137,13 @@ def boundary_motion(
     directions = film.directions(middle)
     sine = np.abs((g * directions).sum(axis=1)) / np.linalg.norm(g, axis=1)
     take(sine < _TOUCHING, BoundaryKind.OUTLINE)
+    left = np.flatnonzero(is_left)
+    if left.size and not surface.field.traits.has_jumps and not surface.field.traits.has_patches:
+        first, other, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
+        index = left[is_edge]
+        kind[index], is_left[index] = int(BoundaryKind.EDGE), False
+        first_position[index], second_position[index] = first[is_edge], other[is_edge]
+        g[index], second[index] = _gradients(tracer, first[is_edge]), _gradients(tracer, other[is_edge])
     return _solved(jumps, film, kind, x, (g, second), (first_position, second_position))
 
 
@@ -165,7 +182,8 @@ def _solved(
             is_pair, -(first * others - second * mixed) / determinant, -first / squares
         )
         weight2 = np.where(is_pair, -(second * squares - first * mixed) / determinant, 0)
-    has_second = is_known & ((kind == int(BoundaryKind.CREASE)) | (kind == int(BoundaryKind.END)))
+    pair_kinds = (BoundaryKind.CREASE, BoundaryKind.EDGE, BoundaryKind.END)
+    has_second = is_known & np.isin(kind, [int(pair) for pair in pair_kinds])
     known, pairs = np.flatnonzero(is_known), np.flatnonzero(has_second)
     return BoundaryMotion(
         kind,
@@ -174,6 +192,31 @@ def _solved(
         np.concatenate([positions[0][known], positions[1][pairs]]),
         np.concatenate([weight1[known], weight2[pairs]]),
     )
+
+
+def _sides_of_edges(
+    jumps: Discontinuities, film: Film, surface: TracedSurface, index: IntArray,
+    is_before: BoolArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
+    """Points on both sides of edges that are outlines: where rays a little farther inside enter the
+    solid, (n, 3), and where they leave it, (n, 3); and whether they leave it so soon, (n,).
+
+    index, is_before: (n,) the jumps, and whether the solid is seen before the jump or behind it.
+    """
+    ends = jumps.screen[index]
+    inside = np.where(is_before[:, None], ends[:, 0], ends[:, 1])
+    inwards = np.where(is_before, -1, 1)[:, None] * np.diff(ends, axis=1)[:, 0]
+    inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
+    directions = film.directions(inside + _INSIDE * inwards)
+    t = np.minimum(jumps.before.t[index], jumps.behind.t[index])
+    reach = _LONGEST_EDGE * film.pixel_width(film.origin + t[:, None] * directions)
+    near, far = np.maximum(t - reach, 0), t + reach
+    rays = RayBatch.of(film.origin[None], directions, near, far, "double")
+    found = crossings_to_numpy(
+        trace_crossings(surface, rays, 2, differentiable=False), len(index), 2
+    )
+    positions = np.where(np.isfinite(found.position), found.position, 0)
+    return positions[:, 0], positions[:, 1], found.count == 2
 
 
 def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:

@@ -44,7 +44,6 @@ from harnack.tracer.derivatives import (
 )
 from harnack.tracer.hits import MIN_RAYS_FOR_CELLS, hits_with_derivatives
 from harnack.tracer.level_contact import HitTolerance, RayStatus
-from harnack.tracer.surface import intersection_of
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.trace_options import TRACE_OPTIONS, shows_keywords, surface_and_options
 from harnack.tracer.traced_surface import TracedSurface
@@ -232,9 +231,7 @@ class _Drawing:
         )  # fmt: skip
         total = [self._averaged(color) for color in colors]
         if len(jumps.axis):
-            surface = self.surface
-            cut = intersection_of([surface.field.domain, surface.clip_volume])
-            motion = boundary_motion(jumps, self.film, self._fine_tracer, cut)
+            motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
             step = jumps.behind.color - jumps.before.color
             smoothing = _smoothing(jumps, motion, step, self.grid, self.film.size)
             total = [
@@ -267,13 +264,15 @@ class _Drawing:
             )
 
     @functools.cached_property
+    def _fine_surface(self) -> TracedSurface:
+        """The surface with a small tolerance, for the discontinuities."""
+        tolerance = HitTolerance(_FINE_TOLERANCE * self.surface.hit_tolerance.distance)
+        return replace(self.surface, tolerance=tolerance, ray_count=0)
+
+    @functools.cached_property
     def _fine_tracer(self) -> SurfaceTracer:
-        """The surface in double precision, with a small tolerance, for the discontinuities."""
-        coarse = self.surface.hit_tolerance
-        fine = replace(
-            self.surface, tolerance=HitTolerance(_FINE_TOLERANCE * coarse.distance), ray_count=0
-        )
-        return fine.tracer(choose_backend("double"), many_rays=False)
+        """The tracer of that surface in double precision."""
+        return self._fine_surface.tracer(choose_backend("double"), many_rays=False)
 
     def _look(self, points: FloatArray) -> Seen:
         """What rays through screen points (n, 2) see, in double precision."""
