@@ -40,6 +40,7 @@ from .fields.solids.primitives import Cuboid, Cylinder, Ellipsoid, Sphere, Torus
 from .fields.solids.round_cones import Capsule
 from .fields.solids.tube import Tube
 from .geometry import Ball, Box, HalfSpace
+from .inverse.picture import picture
 from .live import Slider, page, read_scene, view, write_scene
 from .meshing import MeshingError, check_print, mesh, repair
 from .progress import Progress
@@ -87,6 +88,7 @@ __all__ = [
     "intersection",
     "mesh",
     "page",
+    "picture",
     "read_scene",
     "render",
     "repair",

@@ -37,6 +37,7 @@ ROOMS = (
     "distance",
     "meshing",
     "rendering",
+    "inverse",
     "mesh_to_file",
     "field_from_file",
     "gallery",

@@ -47,17 +47,19 @@ if TYPE_CHECKING:
 
 # The surface is the same on both sides of a jump if positions differ by less than this part of the
 # width of a pixel. Cuts and ends are recognized within the same distance.
-_SAME_POINT = 1e-4
-# A ray touches the surface if the sine of the angle between them is below this number: bisection
-# leaves it at about 1e-3.
-_TOUCHING = 0.02
-# Rays on both sides of an edge pass this part of a pixel inside of it, and the two crossings of such
-# a ray are at most this part of the width of a pixel from the edge.
-_INSIDE, _LONGEST_EDGE = 1e-4, 0.1
+_SAME_POINT = 1e-3
+# A ray touches the surface if the sine of the angle between them is below this number. On a surface
+# with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the outline: a
+# few thousandths for the 1e-4 of a pixel that bisection leaves.
+_TOUCHING = 0.03
+# For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
+# at most this part of the width of a pixel from the edge.
+_INSIDE, _LONGEST_EDGE = 1e-3, 0.1
 # Two gradients are parallel if the squared sine of their angle is below this number.
 _PARALLEL = 1e-10
 # The distance from a curve at which f is sampled, as a part of the size of coordinates there.
 _BESIDE_CURVE = 1e-6
+_TINY = 1e-300
 
 
 class BoundaryKind(IntEnum):
@@ -103,95 +105,111 @@ def boundary_motion(
     is_front = before.t <= behind.t
     x = np.where(is_front[:, None], before.position, behind.position)
     other = np.where(is_front[:, None], behind.position, before.position)
-    middle = jumps.screen.mean(axis=1)
     width = film.pixel_width(x)
-    g = _gradients(tracer, x)
-    # What the boundary needs of a second function; 0 where there is none.
-    second, second_position = np.zeros_like(g), x.copy()
-    first_position = x.copy()
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
-    is_left = np.ones(len(x), bool)
+    conditions = _Conditions(x.copy(), _gradients(tracer, x), x.copy(), np.zeros_like(x))
 
-    def take(which: FloatArray, value: BoundaryKind) -> IntArray:
+    def take(which: BoolArray, value: BoundaryKind) -> IntArray:
         """Give points that have no kind yet this one; returns their indices."""
-        index = np.flatnonzero(is_left & which)
-        kind[index], is_left[index] = int(value), False
+        index = np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & which)
+        kind[index] = int(value)
         return index
 
-    both = before.is_hit & behind.is_hit
     with np.errstate(invalid="ignore"):
-        is_near = both & (np.linalg.norm(x - other, axis=1) < _SAME_POINT * width)
-    if (index := take(is_near, BoundaryKind.CREASE)).size:
-        second[index], second_position[index] = _gradients(tracer, other[index]), other[index]
-    ends = _near_curve(tracer, x, width)
-    if ends is not None and (index := take(ends[0], BoundaryKind.END)).size:
-        sides = _beside_curve(tracer, x[index], ends[1][index], g[index])
-        first_position[index], g[index], second_position[index], second[index] = sides
+        is_same = np.linalg.norm(x - other, axis=1) < _SAME_POINT * width
+    if (index := take(before.is_hit & behind.is_hit & is_same, BoundaryKind.CREASE)).size:
+        conditions.set_second(index, other[index], _gradients(tracer, other[index]))
+    curve = _closest_on_curves(tracer, x)
+    if curve is not None:
+        is_near = np.linalg.norm(x - curve, axis=1) < _SAME_POINT * width
+        if (index := take(is_near, BoundaryKind.END)).size:
+            beside = _beside_curve(x[index], curve[index], conditions.gradient[index])
+            gradients = [_gradients(tracer, points) for points in beside]
+            conditions.set_first(index, beside[0], gradients[0])
+            conditions.set_second(index, beside[1], gradients[1])
     cut = intersection_of([surface.field.domain, surface.clip_volume])
-    if cut is not None:
-        point = upload_vectors(tracer.backend, x)
-        depth = to_numpy(cut.signed_distance(point))
+    if cut is not None and len(x):
+        depth = to_numpy(cut.signed_distance(upload_vectors(tracer.backend, x)))
         if (index := take(np.abs(depth) < _SAME_POINT * width, BoundaryKind.CUT)).size:
-            point = upload_vectors(tracer.backend, x[index])
-            second[index] = to_numpy(cut.outward_normal(point)).reshape(-1, 3)
-    directions = film.directions(middle)
+            normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
+            conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
+    g, directions = conditions.gradient, film.directions(jumps.middle)
     sine = np.abs((g * directions).sum(axis=1)) / np.linalg.norm(g, axis=1)
     take(sine < _TOUCHING, BoundaryKind.OUTLINE)
-    left = np.flatnonzero(is_left)
-    if left.size and not surface.field.traits.has_jumps and not surface.field.traits.has_patches:
-        first, other, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
-        index = left[is_edge]
-        kind[index], is_left[index] = int(BoundaryKind.EDGE), False
-        first_position[index], second_position[index] = first[is_edge], other[is_edge]
-        g[index], second[index] = _gradients(tracer, first[is_edge]), _gradients(tracer, other[is_edge])
-    return _solved(jumps, film, kind, x, (g, second), (first_position, second_position))
+    traits, left = surface.field.traits, np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
+    if left.size and not traits.has_jumps and not traits.has_patches:
+        first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
+        index, first, second = left[is_edge], first[is_edge], second[is_edge]
+        kind[index] = int(BoundaryKind.EDGE)
+        conditions.set_first(index, first, _gradients(tracer, first))
+        conditions.set_second(index, second, _gradients(tracer, second))
+    return _solved(jumps, film, kind, x, conditions)
+
+
+@dataclass(frozen=True)
+class _Conditions:
+    """The conditions g1 . dx = -df1 and, for pairs, g2 . dx = -df2, by which n points stay on a
+    boundary.
+
+    position, gradient: (n, 3) where df1 is taken, and g1.
+    second_position, second_gradient: (n, 3) the same of the second condition; g2 is 0 for none.
+    """
+
+    position: FloatArray
+    gradient: FloatArray
+    second_position: FloatArray
+    second_gradient: FloatArray
+
+    def set_first(self, index: IntArray, position: FloatArray, gradient: FloatArray) -> None:
+        """Set the first condition of points with these indices."""
+        self.position[index], self.gradient[index] = position, gradient
+
+    def set_second(self, index: IntArray, position: FloatArray, gradient: FloatArray) -> None:
+        """Set the second condition of points with these indices."""
+        self.second_position[index], self.second_gradient[index] = position, gradient
 
 
 def _solved(
-    jumps: Discontinuities, film: Film, kind: IntArray, x: FloatArray,
-    gradients: tuple[FloatArray, FloatArray], positions: tuple[FloatArray, FloatArray],
-) -> BoundaryMotion:  # fmt: skip
-    """The motion of points x (n, 3) of these kinds, from the gradients (n, 3) of one or two
-    functions and the positions (n, 3) at which their changes are taken."""
-    g1, g2 = gradients
-    jacobian = film.jacobian(x)
-    is_pair = (kind != int(BoundaryKind.OUTLINE)) & (kind != int(BoundaryKind.UNKNOWN))
-    squares, mixed, others = (np.einsum("ni,ni->n", a, b) for a, b in ((g1, g1), (g1, g2), (g2, g2)))
+    jumps: Discontinuities, film: Film, kind: IntArray, x: FloatArray, conditions: _Conditions
+) -> BoundaryMotion:
+    """The motion of points x (n, 3) of these kinds under their conditions."""
+    g1, g2 = conditions.gradient, conditions.second_gradient
+    squares, mixed, others = (_dots(a, b) for a, b in ((g1, g1), (g1, g2), (g2, g2)))
     determinant = squares * others - mixed**2
-    is_parallel = is_pair & ~(determinant > _PARALLEL * squares * others)
-    kind = np.where(is_parallel, int(BoundaryKind.UNKNOWN), kind)
-    is_pair &= ~is_parallel
     is_single = kind == int(BoundaryKind.OUTLINE)
+    is_pair = ~is_single & (determinant > _PARALLEL * squares * others)
+    jacobian = film.jacobian(x)
     along = np.einsum("nsi,ni->ns", jacobian, np.cross(g1, g2))
-    normal = np.where(
-        is_pair[:, None],
-        np.stack([-along[:, 1], along[:, 0]], axis=1),
-        np.einsum("nsi,ni->ns", jacobian, g1),
-    )
+    turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    normal = np.where(is_pair[:, None], turned, np.einsum("nsi,ni->ns", jacobian, g1))
     length = np.linalg.norm(normal, axis=1)
     is_known = (is_pair | is_single) & (length > 0)
-    kind = np.where(is_known, kind, int(BoundaryKind.UNKNOWN))
-    towards = np.diff(jumps.screen, axis=1)[:, 0]
+    towards = jumps.screen[:, 1] - jumps.screen[:, 0]
     side = np.where((normal * towards).sum(axis=1) < 0, -1.0, 1.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         normal = np.where(is_known[:, None], normal * (side / length)[:, None], 0)
         pulled = np.einsum("ns,nsi->ni", normal, jacobian)
-        first, second = (np.einsum("ni,ni->n", pulled, g) for g in (g1, g2))
-        # The row pulled . G^T (G G^T)^-1, with a minus; for a single row, of g1 alone.
-        weight1 = np.where(
-            is_pair, -(first * others - second * mixed) / determinant, -first / squares
-        )
-        weight2 = np.where(is_pair, -(second * squares - first * mixed) / determinant, 0)
-    pair_kinds = (BoundaryKind.CREASE, BoundaryKind.EDGE, BoundaryKind.END)
-    has_second = is_known & np.isin(kind, [int(pair) for pair in pair_kinds])
-    known, pairs = np.flatnonzero(is_known), np.flatnonzero(has_second)
+        first, second = _dots(pulled, g1), _dots(pulled, g2)
+        # The row -pulled . G^T (G G^T)^-1; for a single condition, of g1 alone.
+        paired = -(first * others - second * mixed) / determinant
+        weight = np.where(is_pair, paired, -first / squares)
+        second_weight = -(second * squares - first * mixed) / determinant
+    kind = np.where(is_known, kind, int(BoundaryKind.UNKNOWN))
+    # What cuts a surface does not change.
+    is_cut = kind == int(BoundaryKind.CUT)
+    known, pairs = np.flatnonzero(is_known), np.flatnonzero(is_known & is_pair & ~is_cut)
     return BoundaryMotion(
         kind,
         normal,
         np.concatenate([known, pairs]),
-        np.concatenate([positions[0][known], positions[1][pairs]]),
-        np.concatenate([weight1[known], weight2[pairs]]),
+        np.concatenate([conditions.position[known], conditions.second_position[pairs]]),
+        np.concatenate([weight[known], second_weight[pairs]]),
     )
+
+
+def _dots(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The inner products (n,) of vectors (n, 3)."""
+    return (a * b).sum(axis=1)
 
 
 def _sides_of_edges(
@@ -212,11 +230,11 @@ def _sides_of_edges(
     reach = _LONGEST_EDGE * film.pixel_width(film.origin + t[:, None] * directions)
     near, far = np.maximum(t - reach, 0), t + reach
     rays = RayBatch.of(film.origin[None], directions, near, far, "double")
-    found = crossings_to_numpy(
+    crossings = crossings_to_numpy(
         trace_crossings(surface, rays, 2, differentiable=False), len(index), 2
     )
-    positions = np.where(np.isfinite(found.position), found.position, 0)
-    return positions[:, 0], positions[:, 1], found.count == 2
+    points = np.where(np.isfinite(crossings.position), crossings.position, 0)
+    return points[:, 0], points[:, 1], crossings.count == 2
 
 
 def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
@@ -227,32 +245,26 @@ def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
     return to_numpy(sample.gradient).reshape(-1, 3)
 
 
-def _near_curve(
-    tracer: SurfaceTracer, x: FloatArray, width: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Whether points x (n, 3) lie at the curves at which all level sets end, and the closest points
-    (n, 3) of these; None if there are no such curves. width: (n,) the width of a pixel there."""
+def _closest_on_curves(tracer: SurfaceTracer, x: FloatArray) -> FloatArray | None:
+    """The points (n, 3), closest to points x (n, 3), of the curves at which all level sets end;
+    None if there are no such curves."""
     boundary = tracer.field.boundary
     if boundary is None or boundary.closest_point is None or not len(x):
         return None
     closest = boundary.closest_point(upload_vectors(tracer.backend, x))
-    curve = to_numpy(closest).reshape(-1, 3)
-    return np.linalg.norm(x - curve, axis=1) < _SAME_POINT * width, curve
+    return to_numpy(closest).reshape(-1, 3)
 
 
-def _beside_curve(
-    tracer: SurfaceTracer, x: FloatArray, curve: FloatArray, g: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _beside_curve(x: FloatArray, curve: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two points (n, 3) beside each point of a curve, in directions that are normal to the curve
-    and to each other, and grad f at both: position, gradient, position, gradient.
+    and to each other.
 
     x, g: (n, 3) points near the points of the curve, and grad f there, which is nearly normal to
         the curve and to the direction away from it.
     """
-    radius = _BESIDE_CURVE * np.maximum(np.abs(x).max(axis=1, keepdims=True), 1e-30)
+    radius = _BESIDE_CURVE * np.maximum(np.abs(x).max(axis=1, keepdims=True), _TINY)
     away = x - curve
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), _TINY)
     around = g - (g * away).sum(axis=1, keepdims=True) * away
-    around /= np.linalg.norm(around, axis=1, keepdims=True)
-    first, second = curve + radius * away, curve + radius * around
-    return first, _gradients(tracer, first), second, _gradients(tracer, second)
+    around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), _TINY)
+    return curve + radius * away, curve + radius * around

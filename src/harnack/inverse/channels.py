@@ -52,7 +52,7 @@ class ChannelFunction:
         kind = cast("Any", type(hits.t))
         if dr.is_array_v(type(shown)):
             shown = [*shown] if dr.depth_v(type(shown)) > 1 else [shown]
-        values = [kind(value) for value in shown]
+        values: list[Real] = [kind(value) for value in shown]
         background = self.background * (len(values) if len(self.background) == 1 else 1)
         if len(background) != len(values):
             raise ValueError(
@@ -67,7 +67,7 @@ def channel_function(show: Any, background: Any, light: Any, film: Film) -> Chan
     Raises:
         TypeError, ValueError: a name that is none of `Show`, or arguments that are no numbers.
     """
-    numbers = np.ravel(cast("Any", background)).tolist()
+    numbers = np.ravel(background).tolist()
     colors = tuple(as_real(number, "background") for number in numbers)
     if callable(show):
         return ChannelFunction(cast("Any", show), colors)

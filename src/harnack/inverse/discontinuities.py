@@ -13,11 +13,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from harnack.backend import BoolArray, FloatArray, IntArray
+    from harnack.inverse.film import Grid
 
 # An interval of a scanline is cut into this many parts, again and again.
-_PARTS, _ROUNDS = 16, 5
+_PARTS, _ROUNDS = 5, 6
 # Jumps of the color count from this fraction of the picture's range of colors on.
 _SMALLEST_JUMP = 0.004
+# A piece that is found with a small probability stands for at most this many others.
+_MAX_WEIGHT = 8.0
 
 
 @dataclass(frozen=True)
@@ -27,18 +30,29 @@ class Seen:
     is_hit: (n,) whether they hit.
     color: (n, c) the channels of the picture.
     t: (n,) the ray parameters of the hits; inf for others.
-    position, normal: (n, 3) of the hits.
+    position: (n, 3) of the hits.
     """
 
     is_hit: BoolArray
     color: FloatArray
     t: FloatArray
     position: FloatArray
-    normal: FloatArray
 
     def at(self, index: IntArray | BoolArray) -> Seen:
         """What the rays with these indices see."""
-        return Seen(*(array[index] for array in vars(self).values()))
+        return Seen(self.is_hit[index], self.color[index], self.t[index], self.position[index])
+
+    def differs_from(self, other: Seen, threshold: float) -> BoolArray:
+        """Whether two rays see different things: only one of them hits, or colors differ by more
+        than the threshold."""
+        jump = np.abs(other.color - self.color).max(axis=-1) > threshold
+        return (self.is_hit != other.is_hit) | jump
+
+    @staticmethod
+    def joined(parts: list[Seen]) -> Seen:
+        """What the rays of all parts see, one part after the other."""
+        arrays = zip(*(vars(part).values() for part in parts), strict=True)
+        return Seen(*map(np.concatenate, arrays))
 
 
 @dataclass(frozen=True)
@@ -48,33 +62,95 @@ class Discontinuities:
     axis: (n,) 0 for horizontal scanlines and 1 for vertical ones.
     screen: (n, 2, 2) two screen points of the scanline, just before and just behind the jump.
     before, behind: what the rays through these two points see.
+    threshold: by how much more than this the color jumps, if both rays hit.
     """
 
     axis: IntArray
     screen: FloatArray
     before: Seen
     behind: Seen
+    threshold: float
+
+    def __len__(self) -> int:
+        """The number of points."""
+        return len(self.axis)
+
+    @property
+    def middle(self) -> FloatArray:
+        """The screen points (n, 2) of the jumps."""
+        return self.screen.mean(axis=1)
+
+    @property
+    def place(self) -> FloatArray:
+        """The coordinates (n,) of the jumps along their scanlines."""
+        return self.middle[np.arange(len(self)), self.axis]
+
+    def at(self, index: IntArray | BoolArray) -> Discontinuities:
+        """The points with these indices."""
+        before, behind = self.before.at(index), self.behind.at(index)
+        return Discontinuities(self.axis[index], self.screen[index], before, behind, self.threshold)
+
+    def neighbors(self) -> tuple[IntArray, IntArray]:
+        """The indices (k,) of jumps, and of the next jumps on the same scanlines."""
+        across = self.middle[np.arange(len(self)), 1 - self.axis]
+        order = np.lexsort((self.place, across, self.axis))
+        first, second = order[:-1], order[1:]
+        is_same = (self.axis[first] == self.axis[second]) & (across[first] == across[second])
+        return first[is_same], second[is_same]
+
+    def genuine(self) -> Discontinuities:
+        """The points whose two rays do see different things."""
+        return self.at(self.before.differs_from(self.behind, self.threshold))
+
+
+def piece_weights(jumps: Discontinuities, grid: Grid) -> FloatArray:
+    """For each jump (n,), the number of pieces for which the piece of the scanline that begins
+    there stands: 1/P, if the piece was found with the probability P only.
+
+    A piece that ends at another jump, behind which the scanline goes on as it was before the piece,
+    is found only if the ray of a column or row lies in it. Each has a random place in its cell, so
+    P = 1 - (1 - p_1)(1 - p_2)..., where p_i is the part of cell i that the piece covers.
+    """
+    weights = np.ones(len(jumps))
+    first, second = jumps.neighbors()
+    goes_on = ~jumps.before.at(first).differs_from(jumps.behind.at(second), jumps.threshold)
+    start, end = jumps.place[first] * grid.samples, jumps.place[second] * grid.samples
+    missed = np.ones(len(first))
+    for k in range(3):
+        cell = np.floor(start) + k
+        missed *= 1 - np.clip(np.minimum(end, cell + 1) - np.maximum(start, cell), 0, 1)
+    # (Of the three cells, the middle one is covered as a whole by pieces that reach the third.)
+    chance = np.maximum(1 - missed, 1 / _MAX_WEIGHT)
+    weights[first] = np.where(goes_on, 1 / chance, 1)
+    return weights
+
+
+def jump_weights(jumps: Discontinuities, pieces: FloatArray) -> FloatArray:
+    """For each jump (n,), the number of jumps for which it stands: that of the piece that begins or
+    ends there, whichever is more. pieces: (n,) the weights of the pieces that begin."""
+    first, second = jumps.neighbors()
+    weights = pieces.copy()
+    weights[second] = np.maximum(weights[second], pieces[first])
+    return weights
 
 
 def find_discontinuities(
-    columns: FloatArray, rows: FloatArray, is_hit: BoolArray, color: FloatArray,
-    look: Callable[[FloatArray], Seen],
-) -> Discontinuities:  # fmt: skip
+    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen]
+) -> Discontinuities:
     """Find the jumps of a picture on the scanlines of a grid of rays.
 
-    columns, rows: (m,) and (k,) screen coordinates of the grid's lines.
     is_hit, color: (k, m) and (k, m, c) what the rays through the points of the grid see.
     look: what rays through screen points (n, 2) see.
 
     Two jumps between neighbors that undo each other, as of a wire that is thinner than the distance
-    of the lines, are not found.
+    of the lines, are not found (`piece_weights`).
     """
-    threshold = _SMALLEST_JUMP * np.ptp(color, axis=(0, 1)).max()
+    threshold = _SMALLEST_JUMP * float(np.ptp(color, axis=(0, 1)).max())
     axes: list[IntArray] = []
     ends: list[FloatArray] = []
     for axis, hit, shown, along, across in (
-        (0, is_hit[1:-1], color[1:-1], columns, rows[1:-1]),
-        (1, is_hit[:, 1:-1].T, color[:, 1:-1].swapaxes(0, 1), rows, columns[1:-1]),
+        (0, is_hit[1:-1], color[1:-1], grid.columns, grid.rows[1:-1]),
+        (1, is_hit[:, 1:-1].T, color[:, 1:-1].swapaxes(0, 1), grid.rows, grid.columns[1:-1]),
     ):
         line, k = np.nonzero(_may_jump(hit, shown, threshold))
         start, end = np.empty((2, len(k), 2))
@@ -83,22 +159,13 @@ def find_discontinuities(
         axes.append(np.full(len(k), axis))
         ends.append(np.stack([start, end], axis=1))
     axis, screen = np.concatenate(axes), np.concatenate(ends)
+    seen, count = look(screen.swapaxes(0, 1).reshape(-1, 2)), len(axis)
+    before, behind = seen.at(np.arange(count)), seen.at(np.arange(count, 2 * count))
+    jumps = Discontinuities(axis, screen, before, behind, threshold).genuine()
     for _ in range(_ROUNDS):
-        axis, screen = _divided(axis, screen, threshold, look)
-    seen = look(screen.reshape(-1, 2))
-    even = 2 * np.arange(len(axis))
-    before, behind = seen.at(even), seen.at(even + 1)
-    jumps = _differ(before.is_hit, behind.is_hit, before.color, behind.color, threshold)
-    return Discontinuities(axis[jumps], screen[jumps], before.at(jumps), behind.at(jumps))
-
-
-def _differ(
-    first_hit: BoolArray, second_hit: BoolArray, first: FloatArray, second: FloatArray,
-    threshold: float,
-) -> BoolArray:  # fmt: skip
-    """Whether two rays see different things: only one of them hits, or colors differ by more than
-    the threshold."""
-    return (first_hit != second_hit) | (np.abs(second - first).max(axis=-1) > threshold)
+        if len(jumps):
+            jumps = _divided(jumps, look)
+    return jumps
 
 
 def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArray:
@@ -114,19 +181,15 @@ def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArr
     return (is_hit[:, 1:] != is_hit[:, :-1]) | (is_large & bends)
 
 
-def _divided(
-    axis: IntArray, screen: FloatArray, threshold: float, look: Callable[[FloatArray], Seen]
-) -> tuple[IntArray, FloatArray]:
+def _divided(jumps: Discontinuities, look: Callable[[FloatArray], Seen]) -> Discontinuities:
     """Divide intervals of scanlines into parts, and keep those whose ends see different things. A
-    smooth change of color is not kept for long, since it is divided among the parts.
-
-    axis, screen: (n,) and (n, 2, 2) the directions and the ends of intervals.
-    """
-    fraction = np.linspace(0, 1, _PARTS + 1)[None, :, None]
-    points = screen[:, :1] * (1 - fraction) + screen[:, 1:] * fraction
-    seen = look(points.reshape(-1, 2))
-    hit = seen.is_hit.reshape(points.shape[:2])
-    color = seen.color.reshape(*points.shape[:2], -1)
-    keep = _differ(hit[:, :-1], hit[:, 1:], color[:, :-1], color[:, 1:], threshold)
-    which, part = np.nonzero(keep)
-    return axis[which], np.stack([points[which, part], points[which, part + 1]], axis=1)
+    smooth change of color is not kept for long, since it is divided among the parts."""
+    fraction = np.linspace(0, 1, _PARTS + 1)[:, None, None]
+    # (parts + 1, n, 2), as what is seen at them: all first points, then all second ones.
+    # (In this form the coordinate of the scanline stays as it is, bit by bit.)
+    points = jumps.screen[:, 0] + (jumps.screen[:, 1] - jumps.screen[:, 0]) * fraction
+    inner = look(points[1:-1].reshape(-1, 2))
+    ends = np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 2)
+    before, behind = Seen.joined([jumps.before, inner]), Seen.joined([inner, jumps.behind])
+    axis = np.tile(jumps.axis, _PARTS)
+    return Discontinuities(axis, ends, before, behind, jumps.threshold).genuine()

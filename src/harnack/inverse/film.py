@@ -1,5 +1,6 @@
-"""The film of a camera: which ray belongs to a point of the picture, and where a point of space is
-seen. Screen coordinates (u, v) count pixels to the right and down, from the upper left corner."""
+"""The film of a camera: which ray belongs to a point of the picture, where a point of space is
+seen, and the grid of lines on which rays are traced. Screen coordinates (u, v) count pixels to the
+right and down, from the upper left corner."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ import numpy as np
 from harnack.rendering.camera import Camera
 
 if TYPE_CHECKING:
-    from harnack.backend import FloatArray
+    from harnack.backend import FloatArray, IntArray
     from harnack.geometry import Volume
 
 
@@ -90,6 +91,12 @@ class Film:
         return 2 * depth * np.linalg.norm(self.right) / self.size[0]
 
 
+def pixel_indices(screen: FloatArray, size: tuple[int, int]) -> IntArray:
+    """The indices (n,) of the pixels in which screen points (n, 2) lie, counted by rows."""
+    column, row = (np.minimum(screen[:, k].astype(int), size[k] - 1) for k in (0, 1))
+    return row * size[0] + column
+
+
 def has_fixed_pose(camera: Camera) -> bool:
     """Whether position, direction and angle of view of a camera are all set, or follow from a box
     that is set, so that they do not depend on the surface."""
@@ -99,3 +106,40 @@ def has_fixed_pose(camera: Camera) -> bool:
         camera.distance is not None and camera.target is not None
     )
     return is_placed and camera.target is not None and camera.fov is not None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The lines of a grid of rays, in screen coordinates: of each column and row of parts of pixels
+    one line, between the borders of the picture.
+
+    columns, rows: the coordinates of the lines, with both borders.
+    samples: the number of lines in a row or column of pixels.
+    """
+
+    columns: FloatArray
+    rows: FloatArray
+    samples: int
+
+    @classmethod
+    def of(cls, size: tuple[int, int], samples: int, random: np.random.Generator | None) -> Grid:
+        """A grid for a picture of this size, with lines at random places in the parts; in their
+        middles for None."""
+        lines: list[FloatArray] = []
+        for side in size:
+            count = side * samples
+            place = np.full(count, 0.5) if random is None else random.uniform(size=count)
+            inner = (np.arange(count) + place) / samples
+            lines.append(np.concatenate([[0.0], inner, [float(side)]]))
+        return cls(lines[0], lines[1], samples)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The number of rows and columns of lines."""
+        return len(self.rows), len(self.columns)
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 2) the screen points at which lines cross, row by row."""
+        u, v = np.meshgrid(self.columns, self.rows)
+        return np.stack([u.ravel(), v.ravel()], axis=1)

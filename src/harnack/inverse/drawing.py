@@ -1,0 +1,302 @@
+"""Draws a picture with derivatives.
+
+A pixel is the mean of the color over its area. Its derivative has two parts. Where the picture is
+smooth, colors change with the hits (`tracer.derivatives`); rays on scanlines give the mean of that
+(`scanline_samples`). At discontinuities, such as outlines, the boundary between two colors moves.
+With the jump dL of the color from one side to the other, and the normal velocity v of the boundary
+on the screen (`boundary_motion`), this second part is the integral of dL v over the boundary's
+length. Derivatives of hits alone leave it out.
+
+Rays go through the points of a grid: one line in each row of pixels and one in each column, at
+random places. Rows and columns are also the scanlines on which discontinuities are searched for. A
+boundary with the unit normal n crosses horizontal scanlines at the density |n_x| dl and vertical
+ones at |n_y| dl. So the sum of dL v |n_x| over the crossings with the former and of dL v |n_y| over
+those with the latter, times the distance of scanlines, has the mean of the integral of dL v (n_x^2
++ n_y^2) dl. It has no bias, and its variance is bounded also where a boundary is tangent to a
+scanline.
+
+The crossings also smooth the picture. On a scanline, a pixel is known by its one ray and by the
+places at which the color jumps: the mean over the line follows from these. For a random place of
+the ray, the difference of this mean from the color of the ray has the mean 0; so, taken with the
+weights n_x^2 and n_y^2, it makes the picture smoother and leaves its mean as it is. Pieces that are
+so short that a ray might not have found them are left as they are."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+
+from harnack.backend import choose_backend, to_numpy
+from harnack.backend.arrays import upload_floats, upload_integers, upload_vectors
+from harnack.backend.elementary import max_norm, safe_norm
+from harnack.enclosures.samples import value_error_bound
+from harnack.inverse.boundary_motion import BoundaryKind, BoundaryMotion, boundary_motion
+from harnack.inverse.discontinuities import (
+    Discontinuities,
+    Seen,
+    find_discontinuities,
+    jump_weights,
+    piece_weights,
+)
+from harnack.inverse.film import has_fixed_pose, pixel_indices
+from harnack.inverse.scanline_samples import scanline_samples
+from harnack.name_suggestions import with_article
+from harnack.tracer.derivatives import change_of_nearest_level, change_of_value, needs_derivatives
+from harnack.tracer.hits import MIN_RAYS_FOR_CELLS, hits_with_derivatives
+from harnack.tracer.level_contact import HitTolerance, RayStatus
+from harnack.tracer.rays import RayBatch
+
+if TYPE_CHECKING:
+    from harnack.backend import Backend, BoolArray, FloatArray, Real
+    from harnack.inverse.channels import ChannelFunction
+    from harnack.inverse.film import Film, Grid
+    from harnack.inverse.scanline_samples import ScanlineSamples
+    from harnack.rendering.camera import Camera
+    from harnack.tracer import Hits
+    from harnack.tracer.surface_tracer import SurfaceTracer
+    from harnack.tracer.traced_surface import TracedSurface
+
+# The tolerance of hits for discontinuities and derivatives, as a part of the usual one.
+_FINE_TOLERANCE = 1e-3
+# If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused.
+_MAX_UNKNOWN = 0.01
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A picture that is being drawn.
+
+    surface: the surface, with the cache of this call.
+    film, grid: where the picture is, and the lines on which rays are traced.
+    channels: what it shows.
+    backend: of the tensor that is drawn. Discontinuities and derivatives are computed in double
+        precision: rays that pass an edge within the rounding of single precision would hit it where
+        its normal turns.
+    random: places rays on scanlines; None for fixed places.
+    camera: the camera of the film.
+    """
+
+    surface: TracedSurface
+    film: Film
+    channels: ChannelFunction
+    grid: Grid
+    backend: Backend
+    random: np.random.Generator | None
+    camera: Camera
+
+    def image(self) -> Any:
+        """The picture, as a Dr.Jit tensor (h, w, c)."""
+        width, height = self.film.size
+        # First of all, since levels would lose their derivatives where these are suspended.
+        has_derivatives = self._has_derivatives
+        colors, is_hit = self._colors_on_grid()
+        image = self._averaged(colors)
+        jumps = find_discontinuities(self.grid, is_hit, colors, self._look)
+        motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
+        pieces = np.ones(len(jumps)) if self.random is None else piece_weights(jumps, self.grid)
+        weights = jump_weights(jumps, pieces)
+        image = image + self._smoothing(jumps, motion, weights)
+        channel_count = image.shape[-1]
+        numbers = upload_floats(self.backend, image.ravel().astype(self.backend.dtype))
+        if has_derivatives:
+            self._check_derivatives(jumps, motion)
+            numbers = self._with_boundary_derivatives(numbers, jumps, motion, weights)
+            random = self.random or np.random.default_rng(0)
+            samples = scanline_samples(self.grid, is_hit, jumps, motion, pieces, random)
+            numbers = self._with_derivatives_inside(numbers, samples)
+        return dr.tensor_t(type(numbers))(numbers, (height, width, channel_count))
+
+    @property
+    def _has_derivatives(self) -> bool:
+        """Whether parameters of the field or levels have derivatives enabled."""
+        zero = self.backend.Array3f(0)
+        return needs_derivatives(self._fine_tracer, zero, zero)
+
+    def _check_derivatives(self, jumps: Discontinuities, motion: BoundaryMotion) -> None:
+        """Raise an error if the picture's derivatives are not known."""
+        field = self.surface.field
+        if field.traits.has_jumps or field.traits.has_patches:
+            raise NotImplementedError(
+                f"pictures of {with_article(type(field).__name__)} have no derivatives, since its "
+                "surface is made of facets or patches: detach its level and parameters"
+            )
+        if not has_fixed_pose(self.camera):
+            raise ValueError(
+                "the camera moves with the surface, which has no derivative: give it a box, as "
+                "harnack.Camera(box=harnack.Box((-1, -1, -1), (1, 1, 1))), or a position, a target "
+                "and a fov"
+            )
+        size = np.abs(jumps.behind.color - jumps.before.color).max(axis=1)
+        is_unknown = motion.kind == int(BoundaryKind.UNKNOWN)
+        if size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
+            raise NotImplementedError(
+                f"{is_unknown.sum()} of {len(jumps)} points at which the picture jumps belong to "
+                "no known kind of boundary, so it is not known how they move; a function `show` "
+                "must not jump where the surface is smooth"
+            )
+
+    # Colors.
+
+    def _rays(self, points: FloatArray, backend: Backend) -> RayBatch:
+        """The rays through screen points (n, 2), as Dr.Jit arrays of a backend."""
+        origin = upload_vectors(backend, self.film.origin[None])
+        directions = upload_vectors(backend, self.film.directions(points))
+        return RayBatch.of(origin, directions, 0.0, np.inf, None)
+
+    def _colors_on_grid(self) -> tuple[FloatArray, BoolArray]:
+        """The channels (k, m, c) of the rays through the points of the grid, and which hit."""
+        rays = self._rays(self.grid.points, self.backend)
+        with dr.suspend_grad():
+            many = rays.count >= MIN_RAYS_FOR_CELLS
+            tracer = self.surface.for_rays(rays.count).tracer(self.backend, many_rays=many)
+            hits, _ = hits_with_derivatives(tracer, rays)
+            seen = self._seen(hits, rays)
+        lost = int(dr.count(hits.status == int(RayStatus.OUT_OF_STEPS))[0])
+        if lost:
+            warnings.warn(
+                f"{lost} rays of a picture ran out of steps and show the background; raise "
+                "max_steps",
+                stacklevel=4,
+            )
+        return seen.color.reshape(*self.grid.shape, -1), seen.is_hit.reshape(self.grid.shape)
+
+    @functools.cached_property
+    def _fine_surface(self) -> TracedSurface:
+        """The surface with a small tolerance, for discontinuities and derivatives."""
+        tolerance = HitTolerance(_FINE_TOLERANCE * self.surface.hit_tolerance.distance)
+        return replace(self.surface, tolerance=tolerance, ray_count=0)
+
+    @functools.cached_property
+    def _fine_tracer(self) -> SurfaceTracer:
+        """The tracer of that surface in double precision."""
+        return self._fine_surface.tracer(choose_backend("double"), many_rays=False)
+
+    def _look(self, points: FloatArray) -> Seen:
+        """What rays through screen points (n, 2) see, in double precision."""
+        if not len(points):
+            channel_count = len(self.channels.background)
+            return Seen(
+                np.zeros(0, bool), np.zeros((0, channel_count)), np.zeros(0), np.zeros((0, 3))
+            )
+        with dr.suspend_grad():
+            rays = self._rays(points, self._fine_tracer.backend)
+            hits, _ = hits_with_derivatives(self._fine_tracer, rays)
+            return self._seen(hits, rays)
+
+    def _seen(self, hits: Hits, rays: RayBatch) -> Seen:
+        """What rays with these hits see, as NumPy arrays."""
+        colors = self.channels.of(hits, rays.direction)
+        dr.eval(colors, hits)
+        columns = [np.broadcast_to(to_numpy(color), (rays.count,)) for color in colors]
+        color = np.stack(columns, axis=1).astype(np.float64)
+        is_hit = np.broadcast_to(to_numpy(hits.is_hit), (rays.count,))
+        t = to_numpy(hits.t).astype(np.float64)
+        return Seen(is_hit, color, t, to_numpy(hits.position).reshape(-1, 3))
+
+    def _averaged(self, colors: FloatArray) -> FloatArray:
+        """The means (h, w, c) of the rays in each pixel."""
+        (width, height), parts = self.film.size, self.grid.samples
+        inner = colors[1:-1, 1:-1].reshape(height, parts, width, parts, -1)
+        return inner.mean(axis=(1, 3))
+
+    def _smoothing(
+        self, jumps: Discontinuities, motion: BoundaryMotion, weights: FloatArray
+    ) -> FloatArray:
+        """What is added to the picture (h, w, c), so that pixels with jumps are means along
+        scanlines. weights: (n,) the number of jumps for which each stands."""
+        width, height = self.film.size
+        parts, n = self.grid.samples, np.arange(len(jumps))
+        place = jumps.place * parts
+        # The place of the ray in the part of a pixel in which the jump lies.
+        columns, rows = self.grid.columns[1:-1] * parts, self.grid.rows[1:-1] * parts
+        part = place.astype(int)
+        is_row = jumps.axis == 0
+        column, row = (np.minimum(part, len(line) - 1) for line in (columns, rows))
+        part, ray = np.where(is_row, column, row), np.where(is_row, columns[column], rows[row])
+        # The length on the other side of the jump than the ray, negative before the jump.
+        length = np.where(ray < place, part + 1 - place, part - place)
+        # Where the normal is not known, half of each direction.
+        square = motion.normal[n, jumps.axis] ** 2
+        square = np.where(motion.kind == int(BoundaryKind.UNKNOWN), 0.5, square)
+        share = np.where(weights > 1, 0, length * square / parts**2)
+        step = jumps.behind.color - jumps.before.color
+        image = np.zeros((height * width, step.shape[1]))
+        np.add.at(image, pixel_indices(jumps.middle, self.film.size), share[:, None] * step)
+        return image.reshape(height, width, -1)
+
+    # Derivatives.
+
+    def _with_boundary_derivatives(
+        self, numbers: Real, jumps: Discontinuities, motion: BoundaryMotion, weights: FloatArray
+    ) -> Real:
+        """The numbers of the picture with the derivatives by the motion of boundaries.
+
+        numbers: (h * w * c,) row by row.
+        weights: (n,) the number of jumps for which each stands.
+        """
+        if not len(motion.index):
+            return numbers
+        tracer, backend, jump = self._fine_tracer, self.backend, motion.index
+        point = upload_vectors(tracer.backend, motion.position)
+        with dr.suspend_grad():
+            sample = tracer.sample(point)
+        change = change_of_value(tracer, point, point, sample.gradient)
+        change = change - change_of_nearest_level(tracer, sample.value)
+        across = np.abs(motion.normal[np.arange(len(jumps)), jumps.axis]) / self.grid.samples
+        # The boundary moves away from what is seen before it.
+        step = ((jumps.before.color - jumps.behind.color) * (across * weights)[:, None])[jump]
+        pixel = pixel_indices(jumps.middle, self.film.size)[jump]
+        for k in range(step.shape[1]):
+            shares = change * upload_floats(tracer.backend, motion.weight * step[:, k])
+            target = upload_integers(backend, pixel * step.shape[1] + k)
+            numbers = _added_at(backend, numbers, shares, target)
+        return numbers
+
+    def _with_derivatives_inside(self, numbers: Real, samples: ScanlineSamples) -> Real:
+        """The numbers of the picture (h * w * c,) with the derivatives of colors where the picture
+        is smooth, as those of rays on scanlines.
+
+        Rays that pass an edge within the tolerance, and so hit no point of the surface, do not
+        count.
+        """
+        backend, tracer = self.backend, self._fine_tracer
+        if not len(samples.axis):
+            return numbers
+        rays = self._rays(samples.screen, tracer.backend)
+        hits, _ = hits_with_derivatives(tracer, rays)
+        colors = self.channels.of(hits, rays.direction)
+        if not any(map(dr.grad_enabled, colors)):
+            return numbers
+        with dr.suspend_grad():
+            point = dr.detach(hits.position)
+            sample = tracer.sample(point)
+            error = value_error_bound(sample, safe_norm(sample.gradient), max_norm(point))
+            gap = dr.abs(tracer.levels.offset_to_nearest(sample.value))
+            index = np.flatnonzero(to_numpy(hits.is_hit & (gap <= 2 * error)))
+            point, normal = (to_numpy(v).reshape(-1, 3)[index] for v in (point, hits.normal))
+        # The share of horizontal or vertical scanlines.
+        image = np.einsum("nsi,ni->ns", self.film.jacobian(point), normal)
+        total = np.maximum((image**2).sum(axis=1), np.finfo(float).tiny)
+        share = image[np.arange(len(index)), samples.axis[index]] ** 2 / total
+        weight = np.zeros(len(samples.axis))
+        weight[index] = share * samples.length[index] / self.grid.samples
+        weights = upload_floats(tracer.backend, weight)
+        pixel = pixel_indices(samples.screen, self.film.size)
+        for k, color in enumerate(colors):
+            if dr.grad_enabled(color):
+                target = upload_integers(backend, pixel * len(colors) + k)
+                shares = dr.select(weights > 0, (color - dr.detach(color)) * weights, 0)
+                numbers = _added_at(backend, numbers, shares, target)
+        return numbers
+
+
+def _added_at(backend: Backend, numbers: Real, shares: Real, index: Any) -> Real:
+    """Numbers with shares added at the given indices. The shares are zeros with derivatives."""
+    total = backend.Float(numbers)
+    dr.scatter_add(total, backend.Float(shares), index)
+    return total
