@@ -45,9 +45,10 @@ if TYPE_CHECKING:
     from harnack.tracer.surface_tracer import SurfaceTracer
     from harnack.tracer.traced_surface import TracedSurface
 
-# The surface is the same on both sides of a jump if positions differ by less than this part of the
-# width of a pixel. Cuts and ends are recognized within the same distance.
-_SAME_POINT = 1e-3
+# Bisection leaves 1e-4 of a pixel, and on a surface under the sine s to the ray that is 1e-4/s of
+# its width. Within this number over s, points are the same on both sides of a jump, or lie on a cut
+# or an end.
+_SAME_POINT = 5e-4
 # A ray touches the surface if the sine of the angle between them is below this number. On a surface
 # with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the outline: a
 # few thousandths for the 1e-4 of a pixel that bisection leaves.
@@ -105,9 +106,11 @@ def boundary_motion(
     is_front = before.t <= behind.t
     x = np.where(is_front[:, None], before.position, behind.position)
     other = np.where(is_front[:, None], behind.position, before.position)
-    width = film.pixel_width(x)
+    g, directions = _gradients(tracer, x), film.directions(jumps.middle)
+    sine = np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
+    near = _SAME_POINT * film.pixel_width(x) / np.maximum(sine, _TOUCHING)
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
-    conditions = _Conditions(x.copy(), _gradients(tracer, x), x.copy(), np.zeros_like(x))
+    conditions = _Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
 
     def take(which: BoolArray, value: BoundaryKind) -> IntArray:
         """Give points that have no kind yet this one; returns their indices."""
@@ -116,25 +119,23 @@ def boundary_motion(
         return index
 
     with np.errstate(invalid="ignore"):
-        is_same = np.linalg.norm(x - other, axis=1) < _SAME_POINT * width
+        is_same = np.linalg.norm(x - other, axis=1) < near
     if (index := take(before.is_hit & behind.is_hit & is_same, BoundaryKind.CREASE)).size:
         conditions.set_second(index, other[index], _gradients(tracer, other[index]))
     curve = _closest_on_curves(tracer, x)
     if curve is not None:
-        is_near = np.linalg.norm(x - curve, axis=1) < _SAME_POINT * width
+        is_near = np.linalg.norm(x - curve, axis=1) < near
         if (index := take(is_near, BoundaryKind.END)).size:
-            beside = _beside_curve(x[index], curve[index], conditions.gradient[index])
+            beside = _beside_curve(x[index], curve[index], g[index])
             gradients = [_gradients(tracer, points) for points in beside]
             conditions.set_first(index, beside[0], gradients[0])
             conditions.set_second(index, beside[1], gradients[1])
     cut = intersection_of([surface.field.domain, surface.clip_volume])
     if cut is not None and len(x):
         depth = to_numpy(cut.signed_distance(upload_vectors(tracer.backend, x)))
-        if (index := take(np.abs(depth) < _SAME_POINT * width, BoundaryKind.CUT)).size:
+        if (index := take(np.abs(depth) < near, BoundaryKind.CUT)).size:
             normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
             conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
-    g, directions = conditions.gradient, film.directions(jumps.middle)
-    sine = np.abs((g * directions).sum(axis=1)) / np.linalg.norm(g, axis=1)
     take(sine < _TOUCHING, BoundaryKind.OUTLINE)
     traits, left = surface.field.traits, np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size and not traits.has_jumps and not traits.has_patches:
