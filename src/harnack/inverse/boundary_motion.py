@@ -45,19 +45,21 @@ if TYPE_CHECKING:
     from harnack.tracer.surface_tracer import SurfaceTracer
     from harnack.tracer.traced_surface import TracedSurface
 
-# Bisection leaves 1e-4 of a pixel, and on a surface under the sine s to the ray that is 1e-4/s of
-# its width. Within this number over s, points are the same on both sides of a jump, or lie on a cut
-# or an end.
-_SAME_POINT = 5e-4
-# A ray touches the surface if the sine of the angle between them is below this number. On a surface
-# with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the outline: a
-# few thousandths for the 1e-4 of a pixel that bisection leaves.
-_TOUCHING = 0.03
+# Within so many times the accuracy of jumps on the screen, points are the same on both sides of a
+# jump, or lie on a cut or an end. On a surface under the sine s to the ray, this is divided by s.
+_SAME_POINT = 3.0
+# A ray may touch the surface if the sine of the angle between them is below this number. On a
+# surface with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the
+# outline: 0.03 for the 0.005 of a pixel that is left, if R is ten pixels.
+_TOUCHING = 0.1
 # For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
 # at most this part of the width of a pixel from the edge.
-_INSIDE, _LONGEST_EDGE = 1e-3, 0.1
-# Two gradients are parallel if the squared sine of their angle is below this number.
-_PARALLEL = 1e-10
+_INSIDE, _LONGEST_EDGE = 0.02, 0.5
+# Two gradients are parallel if the squared sine of their angle is below this number: 1.1 degrees.
+_PARALLEL = 4e-4
+# Points of contact are found by one step of Newton's method along the ray, with a difference of
+# gradients over this part of the width of a pixel; steps of more widths than this are not made.
+_DIFFERENCE, _LONGEST_STEP = 0.05, 30.0
 # The distance from a curve at which f is sampled, as a part of the size of coordinates there.
 _BESIDE_CURVE = 1e-6
 _TINY = 1e-300
@@ -108,7 +110,9 @@ def boundary_motion(
     other = np.where(is_front[:, None], behind.position, before.position)
     g, directions = _gradients(tracer, x), film.directions(jumps.middle)
     sine = np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
-    near = _SAME_POINT * film.pixel_width(x) / np.maximum(sine, _TOUCHING)
+    width = film.pixel_width(x)
+    resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
+    near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
     conditions = _Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
 
@@ -130,13 +134,17 @@ def boundary_motion(
             gradients = [_gradients(tracer, points) for points in beside]
             conditions.set_first(index, beside[0], gradients[0])
             conditions.set_second(index, beside[1], gradients[1])
+            x[index] = curve[index]
     cut = intersection_of([surface.field.domain, surface.clip_volume])
     if cut is not None and len(x):
         depth = to_numpy(cut.signed_distance(upload_vectors(tracer.backend, x)))
         if (index := take(np.abs(depth) < near, BoundaryKind.CUT)).size:
             normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
             conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
-    take(sine < _TOUCHING, BoundaryKind.OUTLINE)
+    if (index := take(sine < _TOUCHING, BoundaryKind.OUTLINE)).size:
+        contact = _contact(tracer, x[index], g[index], directions[index], width[index])
+        conditions.set_first(index, contact, _gradients(tracer, contact))
+        x[index] = contact
     traits, left = surface.field.traits, np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size and not traits.has_jumps and not traits.has_patches:
         first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
@@ -236,6 +244,24 @@ def _sides_of_edges(
     )
     points = np.where(np.isfinite(crossings.position), crossings.position, 0)
     return points[:, 0], points[:, 1], crossings.count == 2
+
+
+def _contact(
+    tracer: SurfaceTracer, x: FloatArray, g: FloatArray, d: FloatArray, width: FloatArray
+) -> FloatArray:
+    """The points (n, 3) at which rays are tangent to level sets, near points x (n, 3).
+
+    g, d: (n, 3) grad f at x, and the directions of the rays. width: (n,) the width of a pixel.
+
+    There grad f . d = 0; the derivative of this along the ray is taken as a difference.
+    """
+    h = _DIFFERENCE * width
+    slope = _dots(g, d)
+    bend = (_dots(_gradients(tracer, x + h[:, None] * d), d) - slope) / h
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = -slope / bend
+    step = np.where(np.abs(step) < _LONGEST_STEP * width, step, 0)
+    return x + step[:, None] * d
 
 
 def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:

@@ -31,10 +31,12 @@ class ChannelFunction:
 
     function: from hits to the channels.
     background: the numbers of the channels where nothing is hit; a single one for all.
+    is_constant: whether the channels of hits are constants.
     """
 
     function: Channels
     background: tuple[float, ...]
+    is_constant: bool = False
 
     def of(self, hits: Hits, direction: Vec3) -> list[Real]:
         """The channels of rays, as Dr.Jit arrays. Where nothing is hit they are the background, and
@@ -86,7 +88,7 @@ def channel_function(show: Any, background: Any, light: Any, film: Film) -> Chan
         raise ValueError(
             f"show is one of {', '.join(names)}, not {show!r}{did_you_mean(show, names)}"
         )
-    return ChannelFunction(functions[show], colors)
+    return ChannelFunction(functions[show], colors, is_constant=show == "mask")
 
 
 def lit_by(light: FloatArray) -> Channels:

@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.inverse.film import Grid
 
-# An interval of a scanline is cut into this many parts, again and again.
-_PARTS, _ROUNDS = 5, 6
+# An interval of a scanline is cut into this many parts, so many times: 1/216 of the distance of the
+# lines. Where colors change on the surface, it is more: at 1/7,776 of a pixel from an outline that
+# bends with a radius of 10 pixels, the normal has turned by 0.3 degrees.
+_PARTS, _ROUNDS, _COLOR_ROUNDS = 6, 3, 5
 # Jumps of the color count from this fraction of the picture's range of colors on.
 _SMALLEST_JUMP = 0.004
 # A piece that is found with a small probability stands for at most this many others.
@@ -98,10 +100,6 @@ class Discontinuities:
         is_same = (self.axis[first] == self.axis[second]) & (across[first] == across[second])
         return first[is_same], second[is_same]
 
-    def genuine(self) -> Discontinuities:
-        """The points whose two rays do see different things."""
-        return self.at(self.before.differs_from(self.behind, self.threshold))
-
 
 def piece_weights(jumps: Discontinuities, grid: Grid) -> FloatArray:
     """For each jump (n,), the number of pieces for which the piece of the scanline that begins
@@ -135,12 +133,14 @@ def jump_weights(jumps: Discontinuities, pieces: FloatArray) -> FloatArray:
 
 
 def find_discontinuities(
-    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen]
-) -> Discontinuities:
+    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen],
+    *, is_constant: bool,
+) -> Discontinuities:  # fmt: skip
     """Find the jumps of a picture on the scanlines of a grid of rays.
 
     is_hit, color: (k, m) and (k, m, c) what the rays through the points of the grid see.
     look: what rays through screen points (n, 2) see.
+    is_constant: whether all points of the surface have the same color.
 
     Two jumps between neighbors that undo each other, as of a wire that is thinner than the distance
     of the lines, are not found (`piece_weights`).
@@ -159,12 +159,15 @@ def find_discontinuities(
         axes.append(np.full(len(k), axis))
         ends.append(np.stack([start, end], axis=1))
     axis, screen = np.concatenate(axes), np.concatenate(ends)
-    seen, count = look(screen.swapaxes(0, 1).reshape(-1, 2)), len(axis)
-    before, behind = seen.at(np.arange(count)), seen.at(np.arange(count, 2 * count))
-    jumps = Discontinuities(axis, screen, before, behind, threshold).genuine()
-    for _ in range(_ROUNDS):
-        if len(jumps):
-            jumps = _divided(jumps, look)
+    points = _divisions(screen)
+    seen = look(points.reshape(-1, 2))
+    jumps = _between(axis, points, seen, threshold)
+    for _ in range((_ROUNDS if is_constant else _COLOR_ROUNDS) - 1):
+        points = _divisions(jumps.screen)
+        # The ends have been looked at.
+        inner = look(points[1:-1].reshape(-1, 2))
+        seen = Seen.joined([jumps.before, inner, jumps.behind])
+        jumps = _between(jumps.axis, points, seen, threshold)
     return jumps
 
 
@@ -181,15 +184,22 @@ def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArr
     return (is_hit[:, 1:] != is_hit[:, :-1]) | (is_large & bends)
 
 
-def _divided(jumps: Discontinuities, look: Callable[[FloatArray], Seen]) -> Discontinuities:
-    """Divide intervals of scanlines into parts, and keep those whose ends see different things. A
-    smooth change of color is not kept for long, since it is divided among the parts."""
+def _divisions(screen: FloatArray) -> FloatArray:
+    """The points (parts + 1, n, 2) that divide intervals (n, 2, 2) into parts, with their ends."""
     fraction = np.linspace(0, 1, _PARTS + 1)[:, None, None]
-    # (parts + 1, n, 2), as what is seen at them: all first points, then all second ones.
     # (In this form the coordinate of the scanline stays as it is, bit by bit.)
-    points = jumps.screen[:, 0] + (jumps.screen[:, 1] - jumps.screen[:, 0]) * fraction
-    inner = look(points[1:-1].reshape(-1, 2))
+    return screen[:, 0] + (screen[:, 1] - screen[:, 0]) * fraction
+
+
+def _between(axis: IntArray, points: FloatArray, seen: Seen, threshold: float) -> Discontinuities:
+    """The parts of n intervals whose ends see different things. A smooth change of color is not
+    kept for long, since it is divided among the parts.
+
+    axis: (n,) the directions of the scanlines.
+    points, seen: (parts + 1, n, 2) the ends of the parts, and what is seen there, in this order.
+    """
     ends = np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 2)
-    before, behind = Seen.joined([jumps.before, inner]), Seen.joined([inner, jumps.behind])
-    axis = np.tile(jumps.axis, _PARTS)
-    return Discontinuities(axis, ends, before, behind, jumps.threshold).genuine()
+    count, total = len(axis), len(seen.is_hit)
+    before, behind = seen.at(np.arange(total - count)), seen.at(np.arange(count, total))
+    parts = Discontinuities(np.tile(axis, _PARTS), ends, before, behind, threshold)
+    return parts.at(before.differs_from(behind, threshold))

@@ -63,6 +63,8 @@ if TYPE_CHECKING:
 
 # The tolerance of hits for discontinuities and derivatives, as a part of the usual one.
 _FINE_TOLERANCE = 1e-3
+# A hit within the tolerance of the surface may be this many tolerances from it along its ray.
+_LONGEST_STEP = 1000.0
 # If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused.
 _MAX_UNKNOWN = 0.01
 
@@ -96,7 +98,9 @@ class Drawing:
         has_derivatives = self._has_derivatives
         colors, is_hit = self._colors_on_grid()
         image = self._averaged(colors)
-        jumps = find_discontinuities(self.grid, is_hit, colors, self._look)
+        jumps = find_discontinuities(
+            self.grid, is_hit, colors, self._look, is_constant=self.channels.is_constant
+        )
         motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
         pieces = np.ones(len(jumps)) if self.random is None else piece_weights(jumps, self.grid)
         weights = jump_weights(jumps, pieces)
@@ -106,6 +110,7 @@ class Drawing:
         if has_derivatives:
             self._check_derivatives(jumps, motion)
             numbers = self._with_boundary_derivatives(numbers, jumps, motion, weights)
+        if has_derivatives and not self.channels.is_constant:
             random = self.random or np.random.default_rng(0)
             samples = scanline_samples(self.grid, is_hit, jumps, motion, pieces, random)
             numbers = self._with_derivatives_inside(numbers, samples)
@@ -268,7 +273,7 @@ class Drawing:
         if not len(samples.axis):
             return numbers
         rays = self._rays(samples.screen, tracer.backend)
-        hits, _ = hits_with_derivatives(tracer, rays)
+        hits, _ = hits_with_derivatives(tracer, rays, longest_step=_LONGEST_STEP)
         colors = self.channels.of(hits, rays.direction)
         if not any(map(dr.grad_enabled, colors)):
             return numbers

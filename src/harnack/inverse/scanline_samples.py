@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # Pieces shorter than this part of a pixel are left out: they are mostly none, but rays that pass an
 # edge within the tolerance.
-_SHORTEST = 1e-3
+_SHORTEST = 0.01
 # The number of rays of a piece: so many for each line that it crosses, and at least so many.
 _PER_LINE, _FEWEST = 0.5, 4
 

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 # Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
 # for sums over trees, which are then evaluated without truncation.
 _NEWTON_STEPS, _NEWTON_STEPS_OF_SUMS = 4, 3
+NEWTON_STEP = 4.0
+"""The longest of these steps along a ray, in tolerances."""
 
 
 # Fields without Dr.Jit numbers, which are checked only once (until an attribute is set).
@@ -115,8 +117,9 @@ def refuse_derivative(tracer: SurfaceTracer, o: Vec3, d: Vec3, result_name: str,
 
 
 def attach_derivatives(
-    tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3
-) -> tuple[Real, Vec3]:
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, normal: Vec3,
+    *, longest_step: float = NEWTON_STEP,
+) -> tuple[Real, Vec3]:  # fmt: skip
     """Return the ray parameters t of hits, refined up to rounding, with derivatives attached; and
     the normals (3,) at these points, with derivatives, or such that these are refused.
 
@@ -124,6 +127,7 @@ def attach_derivatives(
     o, d: (3,) origins and directions of the rays, possibly with derivatives.
     end: how the rays ended.
     normal: (3,) the unit normals of the trace, which are kept if there is no hit.
+    longest_step: the longest step of Newton's method along a ray, in tolerances.
 
     Newton's method first moves t to the level. Then -change/slope is the derivative of t, where
     `change` is a zero whose derivative is that of f - level at fixed t. The normal is that of the
@@ -156,7 +160,7 @@ def attach_derivatives(
             slope = dr.dot(sample.gradient, direction)
             step = dr.select(is_hit & (slope != 0), offset / slope, 0)
             # A grazing ray may have no root to converge to; stay near the proved point.
-            limit = 4 * tracer.tolerance.distance
+            limit = longest_step * tracer.tolerance.distance
             t_hit = t_hit + dr.clip(step, -limit, limit)
         x = dr.fma(backend.Array3f(t_hit), direction, origin)
         sample = tracer.sample(x)

@@ -26,7 +26,12 @@ from harnack.backend.loops import compute_on_active
 from harnack.backend.tensors import array_to_tensor, is_tensor
 from harnack.backend.validation import check_no_derivatives, flag
 from harnack.cluster.dask_arrays import accepts_dask_arrays
-from harnack.tracer.derivatives import attach_derivatives, needs_derivatives, refuse_derivative
+from harnack.tracer.derivatives import (
+    NEWTON_STEP,
+    attach_derivatives,
+    needs_derivatives,
+    refuse_derivative,
+)
 from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.level_contact import HitTolerance, RayStatus
 from harnack.tracer.ray_clearance import (
@@ -306,10 +311,16 @@ def _trace(surface: TracedSurface, rays: RayBatch, *, measures_clearance: bool) 
     return hits
 
 
-def hits_with_derivatives(tracer: SurfaceTracer, rays: RayBatch) -> tuple[Hits, bool]:
+def hits_with_derivatives(
+    tracer: SurfaceTracer, rays: RayBatch, *, longest_step: float = NEWTON_STEP
+) -> tuple[Hits, bool]:
     """Return the first hits of rays with a surface, as Dr.Jit arrays, and whether they carry
     derivatives: if the rays were given as Dr.Jit arrays, and rays, levels or field have derivatives
-    enabled."""
+    enabled.
+
+    longest_step: by so many tolerances, hits with derivatives may move along the ray in a step of
+        Newton's method, to come to the level exactly.
+    """
     o, d = rays.origin, rays.direction
     # The trace itself has no derivatives; they are attached to its results.
     with dr.suspend_grad():
@@ -318,7 +329,7 @@ def hits_with_derivatives(tracer: SurfaceTracer, rays: RayBatch) -> tuple[Hits, 
             hits = _with_searched_distances(tracer, hits, doubt)
     has_derivatives = not rays.is_numpy and needs_derivatives(tracer, o, d)
     if has_derivatives:
-        t, normal = attach_derivatives(tracer, o, d, end, hits.normal)
+        t, normal = attach_derivatives(tracer, o, d, end, hits.normal, longest_step=longest_step)
         # Results without a known derivative raise an error if it is used.
         value, uncertainty = (
             refuse_derivative(tracer, o, d, name, array)
