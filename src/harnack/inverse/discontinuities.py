@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 _PARTS, _ROUNDS, _COLOR_ROUNDS = 6, 3, 5
 # Jumps of the color count from this fraction of the picture's range of colors on.
 _SMALLEST_JUMP = 0.004
+# A jump has at least this part of the change of color in the interval that was divided last.
+_LEAST_OF_JUMP = 0.6
 # A piece that is found with a small probability stands for at most this many others.
 _MAX_WEIGHT = 8.0
 
@@ -162,12 +164,13 @@ def find_discontinuities(
     points = _divisions(screen)
     seen = look(points.reshape(-1, 2))
     jumps = _between(axis, points, seen, threshold)
-    for _ in range((_ROUNDS if is_constant else _COLOR_ROUNDS) - 1):
+    rounds = _ROUNDS if is_constant else _COLOR_ROUNDS
+    for k in range(1, rounds):
         points = _divisions(jumps.screen)
         # The ends have been looked at.
         inner = look(points[1:-1].reshape(-1, 2))
         seen = Seen.joined([jumps.before, inner, jumps.behind])
-        jumps = _between(jumps.axis, points, seen, threshold)
+        jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == rounds)
     return jumps
 
 
@@ -191,15 +194,26 @@ def _divisions(screen: FloatArray) -> FloatArray:
     return screen[:, 0] + (screen[:, 1] - screen[:, 0]) * fraction
 
 
-def _between(axis: IntArray, points: FloatArray, seen: Seen, threshold: float) -> Discontinuities:
+def _between(
+    axis: IntArray, points: FloatArray, seen: Seen, threshold: float, *, is_last: bool = False
+) -> Discontinuities:
     """The parts of n intervals whose ends see different things. A smooth change of color is not
     kept for long, since it is divided among the parts.
 
     axis: (n,) the directions of the scanlines.
     points, seen: (parts + 1, n, 2) the ends of the parts, and what is seen there, in this order.
+    is_last: whether to leave out slopes that are still steep, as those of the normal near outlines
+        and corners are. Of the change in an interval, a jump has nearly all, and a part of a slope
+        only a part: near an outline, where the change is like a square root, at most 6^(-1/2).
     """
     ends = np.stack([points[:-1], points[1:]], axis=2).reshape(-1, 2, 2)
     count, total = len(axis), len(seen.is_hit)
     before, behind = seen.at(np.arange(total - count)), seen.at(np.arange(count, total))
     parts = Discontinuities(np.tile(axis, _PARTS), ends, before, behind, threshold)
-    return parts.at(before.differs_from(behind, threshold))
+    differ = before.differs_from(behind, threshold)
+    if is_last:
+        color, first_of_last = seen.color, total - count
+        whole = np.tile(np.abs(color[first_of_last:] - color[:count]).max(axis=1), _PARTS)
+        step = np.abs(behind.color - before.color).max(axis=1)
+        differ &= (before.is_hit != behind.is_hit) | (step > _LEAST_OF_JUMP * whole)
+    return parts.at(differ)
