@@ -121,7 +121,13 @@ class RecordTable:
         return numbers
 
     def for_each(
-        self, body: RecordBody, state: LoopValues, label: str, active: Mask = True
+        self,
+        body: RecordBody,
+        state: LoopValues,
+        label: str,
+        active: Mask = True,
+        *,
+        is_sum: bool = False,
     ) -> LoopValues:
         """Apply `body` to all records in turn, on active lanes only, and return the final state.
 
@@ -130,6 +136,9 @@ class RecordTable:
         state: a tuple of arrays.
         label: the name of the loop in Dr.Jit's output.
         active: mask of the lanes on which the loop runs; other lanes keep their state.
+        is_sum: whether the state is a tuple of sums: `body` adds numbers to it that do not depend
+            on it. Then Dr.Jit can run the loop backwards, and the sums can be differentiated in
+            reverse mode with respect to the table and to all that `body` uses.
 
         A packet of lanes, which a processor computes together, skips the loop if all of its lanes
         are inactive.
@@ -152,4 +161,6 @@ class RecordTable:
 
         # The index of the iteration comes before the state, and is dropped at the end.
         start = (self.backend.UInt32(0), *state)
-        return dr.while_loop(start, is_active, read_and_apply, label=label)[1:]
+        return dr.while_loop(
+            start, is_active, read_and_apply, label=label, max_iterations=-1 if is_sum else None
+        )[1:]

@@ -85,7 +85,7 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
     try:
         result = coordinates[0].coerce(formula(*coordinates))
     except TypeError:  # it accepts ranges of derivatives alone
-        return None
+        return None if ATTACHED in vars(field) else evaluator.differentiable_gradient(p)
     gradient = type(p)(*(0 * p.x + entry for entry in result.first_derivatives))
     with dr.suspend_grad():
         value = evaluator.evaluate(dr.detach(p)).gradient
@@ -94,7 +94,8 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
 
 def _formula_of_attached(field: Any, p: Vec3) -> Callable[[Any, Any, Any], Any]:
     """The formula of a field with its numbers attached, on the backend of points p."""
-    own_formula(field)  # raises an error if a user's class has another function
+    if hasattr(field, "formula"):
+        own_formula(field)  # raises an error if a user's class has another function
     return attached(field, backend_of(p)).formula
 
 

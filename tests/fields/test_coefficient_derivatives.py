@@ -1,0 +1,160 @@
+"""Derivatives of blobs, series and networks by all arrays of numbers that they are made of, against
+central differences in double precision, in forward and in reverse mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from drjit.llvm.ad import Array3f64, Float64, TensorXf64
+
+import harnack as hk
+from harnack.backend import choose_backend
+from tests.backend.test_kernels import compiled
+from tests.fields.test_number_derivatives import outputs, rays
+
+pytestmark = pytest.mark.skipif(choose_backend().name != "llvm", reason="types of the CPU")
+
+RNG = np.random.default_rng(3)
+FEW = {
+    "centers": np.array([[0.3, 0.1, 0], [-0.3, 0, 0.2], [0, -0.3, -0.2], [0.1, 0.3, 0.4]]),
+    "radii": np.array([0.4, 0.5, 0.35, 0.3]),
+    "weights": np.array([1.0, 0.9, 1.2, -0.4]),
+}
+MANY = {
+    "centers": np.random.default_rng(1).uniform(-0.6, 0.6, (80, 3)),
+    "radii": np.random.default_rng(2).uniform(0.1, 0.3, 80),
+    "weights": np.random.default_rng(4).uniform(0.5, 1, 80),
+}
+GROUPS = [2, 0, 2, 1]
+
+
+def cases() -> Iterator[Any]:
+    for kernel in ("compact", "gaussian", "cubic", "sextic"):
+        yield f"blobs {kernel}", FEW, lambda kernel=kernel, **n: hk.Blobs(kernel=kernel, **n)
+    yield "blobs in groups", FEW, lambda **n: hk.Blobs(groups=GROUPS, **n)
+    yield "many blobs", MANY, hk.Blobs
+    yield (
+        "many blobs in groups", MANY, lambda **n: hk.Blobs(groups=np.arange(80) % 3, **n)
+    )  # fmt: skip
+    yield "blobs of one radius", {**FEW, "radii": 0.5}, hk.Blobs
+    yield (
+        "a sum of blobs",
+        {k: FEW[k] for k in ("centers", "radii")},
+        lambda **n: hk.Blobs(**n) * 0.8 + hk.Blobs([[0, 0, 0.6]], 0.5),
+    )
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize(
+    ("numbers", "make"), [pytest.param(*rest, id=name) for name, *rest in cases()]
+)
+def test_derivatives_agree_with_differences(numbers: dict[str, Any], make: Any) -> None:
+    check(numbers, make)
+
+
+def tree_map(function: Callable[..., Any], *trees: Any) -> Any:
+    """The function of all numbers and arrays in mappings, lists and tuples."""
+    first = trees[0]
+    if isinstance(first, dict):
+        return {k: tree_map(function, *(tree[k] for tree in trees)) for k in first}
+    if isinstance(first, list | tuple):
+        return type(first)(tree_map(function, *entries) for entries in zip(*trees, strict=True))
+    return function(*trees)
+
+
+def leaves(tree: Any) -> list[Any]:
+    found: list[Any] = []
+    tree_map(found.append, tree)
+    return found
+
+
+def check(numbers: Any, make: Callable[..., Any]) -> None:
+    """In one direction of all numbers at once, which shows if one is left out."""
+    origins, directions = rays()
+    points = RNG.uniform(-0.8, 0.8, (200, 3))
+    change = tree_map(
+        lambda v: RNG.choice([-1, 1], np.shape(v)) * RNG.uniform(0.5, 1, np.shape(v)), numbers
+    )
+
+    def shifted(h: float) -> dict[str, Any]:
+        moved = tree_map(lambda v, c: np.array(v, float) + h * c, numbers, change)
+        plain = tree_map(lambda v: v.item() if v.shape == () else v, moved)
+        results = outputs(make(**plain), points, origins, directions)
+        return {name: np.array(array) for name, array in results.items()}
+
+    h = 1e-5
+    above, below, further, back = (shifted(s) for s in (h, -h, 2 * h, -2 * h))
+    attached = tree_map(
+        lambda v: Float64(v) if np.shape(v) == () else TensorXf64(np.array(v, float)), numbers
+    )
+    for number in leaves(attached):
+        dr.enable_grad(number)
+    results = outputs(make(**attached), points, origins, directions)
+    tree_map(lambda a, c: dr.set_grad(a, type(a)(np.array(c))), attached, change)
+    dr.forward_to(*results.values(), flags=dr.ADFlag.AllowNoGrad)
+    forward: dict[str, Any] = {}
+    for name, array in results.items():
+        derivative = np.array(dr.grad(array))
+        difference = (above[name] - below[name]) / (2 * h)
+        wide = (further[name] - back[name]) / (4 * h)
+        is_smooth = np.abs(difference - wide) < 1e-5 * (1 + np.abs(difference))
+        assert is_smooth.mean() > 0.8, (name, is_smooth.mean())
+        error = np.abs(derivative - difference)[is_smooth]
+        scale = max(np.abs(difference[is_smooth]).max(), 1e-3)
+        assert np.quantile(error, 0.98) < 1e-5 * scale, (name, error.max(), scale)
+        forward[name] = derivative
+    # Reverse mode gives the same directional derivative.
+    results = outputs(make(**attached), points, origins, directions)
+    total, expected = Float64(0), 0.0
+    for name, array in results.items():
+        is_finite = np.isfinite(forward[name]) & (np.abs(forward[name]) < 1e3)
+        weights = np.where(is_finite, RNG.uniform(0.5, 1, is_finite.shape), 0)
+        total += dr.sum(dr.select(Float64(weights) != 0, array, 0) * Float64(weights))
+        expected += np.where(is_finite, forward[name], 0) @ weights
+    for number in leaves(attached):
+        dr.clear_grad(number)
+    dr.backward(total)
+    pairs = zip(leaves(attached), leaves(change), strict=True)
+    found = sum((np.ravel(dr.grad(a)) * np.ravel(c)).sum() for a, c in pairs)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
+def test_other_numbers_of_blobs_compile_nothing() -> None:
+    def step(k: int) -> None:
+        centers = TensorXf64(FEW["centers"] + 0.01 * k)
+        radii = Float64(FEW["radii"] + 0.01 * k)
+        dr.enable_grad(centers, radii)
+        hits = hk.trace(
+            hk.Blobs(centers, radii), Array3f64([0.0, 0.1], 0.1, 3), Array3f64(0, 0, -1)
+        )
+        dr.backward(dr.sum(hits.t + hits.normal.x))
+
+    step(0), step(1)
+    assert compiled(lambda: (step(2), step(3))) == 0
+
+
+def test_gradients_at_centers_are_finite() -> None:
+    for kernel in ("compact", "gaussian", "cubic", "sextic"):
+        centers = Array3f64([0.1], 0.2, 0.3)
+        dr.enable_grad(centers)
+        field = hk.Blobs(centers, 0.5, kernel=kernel)
+        dr.backward(
+            field.value(Array3f64(0.1, 0.2, 0.3)) + field.gradient(Array3f64(0.1, 0.2, 0.3)).x
+        )
+        assert np.isfinite(dr.grad(centers)).all()
+
+
+def test_blobs_by_lists_of_numbers() -> None:
+    radius = Float64(0.5)
+    dr.enable_grad(radius)
+    field = hk.Blobs([[0.0, 0, 0], [5, 0, 0]], [radius, 0.3], kernel="compact")
+    dr.backward(field.gradient(Array3f64(0.4, 0.0, 0.0)).x)
+    whole = Float64([0.5, 0.3])
+    dr.enable_grad(whole)
+    field = hk.Blobs([[0.0, 0, 0], [5, 0, 0]], whole, kernel="compact")
+    dr.backward(field.gradient(Array3f64(0.4, 0.0, 0.0)).x)
+    np.testing.assert_allclose(whole.grad, [*radius.grad, 0], rtol=1e-12)
