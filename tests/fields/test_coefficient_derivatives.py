@@ -46,6 +46,52 @@ def cases() -> Iterator[Any]:
         {k: FEW[k] for k in ("centers", "radii")},
         lambda **n: hk.Blobs(**n) * 0.8 + hk.Blobs([[0, 0, 0.6]], 0.5),
     )
+    for kind in (hk.Gyroid, hk.fields.SchwarzP, hk.fields.SchwarzD):
+        yield kind.__name__, {"cell": 1.3}, lambda kind=kind, **n: kind(domain=hk.Ball(), **n)
+    yield (
+        "waves",
+        {"a": 1.2, "k": 3.0, "phase": 0.3, "vector": np.array([1.0, 0, 2.0]), "b": 0.7},
+        waves,
+    )
+    yield (
+        "a spherical harmonic", {"radius": 1.2}, lambda radius: hk.SphericalHarmonic(3, 1, radius=radius) - 0.1
+    )  # fmt: skip
+    yield "a harmonic polynomial", {"a": 1.3, "b": 0.4, "c": 0.2, "d": 0.3}, polynomial
+    yield "lobes", {"scale": 1.4}, lambda scale: hk.fields.Lobes(3, 2, scale=scale)
+    yield (
+        "positive lobes",
+        {"scale": 1.4},
+        lambda scale: hk.fields.Lobes(3, 2, scale=scale, sign="positive"),
+    )
+    series = np.random.default_rng(5).normal(size=(3, 4, 5))
+    yield (
+        "a series",
+        {"coefficients": series},
+        lambda coefficients: hk.fields.FourierSeries(coefficients, hk.Box((-1,) * 3, (1,) * 3)),
+    )
+    yield "a root", {"height": 1.2}, lambda height: hk.fields.RiemannSurface("sqrt", height=height)
+
+
+def polynomial(a: Any, b: Any, c: Any, d: Any) -> hk.Field:
+    coefficients = {
+        (2, 1, 0): a,
+        (0, 1, 2): -a,
+        (2, 0, 0): b,
+        (0, 2, 0): -b - c,
+        (0, 0, 2): c,
+        (0, 0, 0): d,
+    }
+    return hk.HarmonicPolynomial(coefficients)
+
+
+def waves(a: Any, k: Any, phase: Any, vector: Any, b: Any) -> hk.Field:
+    sine = hk.fields.sine_factor
+    terms = [
+        hk.fields.WaveProduct(a, x=sine(k, phase), y=hk.fields.cosine_factor(3.0)),
+        hk.fields.PlaneWave(b, vector, phase),
+        hk.fields.WaveProduct(1.0, z=sine(k)),
+    ]
+    return hk.fields.EigenfunctionSum(terms, domain=hk.Ball())
 
 
 @pytest.mark.few(3)
@@ -123,15 +169,19 @@ def check(numbers: Any, make: Callable[..., Any]) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
-def test_other_numbers_of_blobs_compile_nothing() -> None:
+@pytest.mark.few(2)
+@pytest.mark.parametrize(
+    ("numbers", "make"), [pytest.param(*rest, id=name) for name, *rest in cases()]
+)
+def test_other_numbers_compile_nothing(numbers: Any, make: Any) -> None:
     def step(k: int) -> None:
-        centers = TensorXf64(FEW["centers"] + 0.01 * k)
-        radii = Float64(FEW["radii"] + 0.01 * k)
-        dr.enable_grad(centers, radii)
-        hits = hk.trace(
-            hk.Blobs(centers, radii), Array3f64([0.0, 0.1], 0.1, 3), Array3f64(0, 0, -1)
-        )
-        dr.backward(dr.sum(hits.t + hits.normal.x))
+        moved = tree_map(lambda v: np.array(v, float) * (1 + 0.001 * k), numbers)
+        attached = tree_map(lambda v: Float64(v) if v.shape == () else TensorXf64(v), moved)
+        for number in leaves(attached):
+            dr.enable_grad(number)
+        x = Float64([0.0, 0.1, 0.2])
+        hits = hk.trace(make(**attached), Array3f64(x, 0.1, 3), Array3f64(0, 0, -1))
+        dr.backward(dr.sum(dr.select(hits.is_hit, hits.t + hits.normal.x, 0)))
 
     step(0), step(1)
     assert compiled(lambda: (step(2), step(3))) == 0

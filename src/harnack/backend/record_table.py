@@ -92,6 +92,17 @@ class RecordTable:
         """The memory in bytes of a table of so many records of `width` numbers, with padding."""
         return records * -(-width // PACKET) * PACKET * np.dtype(backend.dtype).itemsize
 
+    def with_derivatives(self, entries: Real) -> RecordTable:
+        """Return the table with the derivatives of `entries`, all numbers row after row with
+        padding, for sums by `for_each` that are differentiated with respect to them.
+
+        Reverse mode adds up the derivatives of the buffer in the loop. Dr.Jit 1.5 may read them too
+        early if they are passed on to a gather as they are, and loses some now and then; a
+        multiplication waits for the loop.
+        """
+        one = dr.opaque(self.backend.Float, 1)  # a product with a literal would be none
+        return replace(self, buffer=dr.replace_grad(self.buffer, entries * one))
+
     def view(self, first: Any, trips: Any) -> RecordTable:
         """Return a part of the table: `trips` consecutive records, from record `first` on. Both
         numbers may differ between lanes. An iteration of `for_each` must read a single record.

@@ -8,9 +8,11 @@ values; the class gives value and gradient at a point as expressions of them, an
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import drjit as dr
 import numpy as np
@@ -20,11 +22,22 @@ from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend import backend_of, to_numpy
 from harnack.backend.arrays import upload_floats
 from harnack.backend.validation import as_real_array
+from harnack.fields.evaluator import Evaluator
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
 
-__all__ = ["ExpressionFormula", "attached_array", "host_array", "separate_variable"]
+FieldType = TypeVar("FieldType")
+
+__all__ = [
+    "ExpressionFormula",
+    "attached_array",
+    "host_array",
+    "opaque_numbers",
+    "scaled_in_space",
+    "separate_variable",
+    "with_formula",
+]
 
 
 def host_array(
@@ -83,6 +96,65 @@ def _flat(argument: Any, backend: Backend) -> Real:
     if not _is_drjit(argument):
         return upload_floats(backend, np.asarray(argument, np.float64).ravel())
     return backend.Float(argument.array if dr.is_tensor_v(argument) else dr.ravel(argument))
+
+
+def opaque_numbers(value: Any, backend: Backend) -> Any:
+    """A copy of tuples, mappings and dataclasses with all floats as numbers of a backend that are
+    kernel parameters, so that other numbers compile no other kernel. Equal floats become the same
+    parameter."""
+    known: dict[float, Real] = {}
+
+    def converted(part: Any) -> Any:
+        """The copy of a part of the value."""
+        if isinstance(part, float):
+            if part not in known:
+                known[part] = dr.opaque(backend.Float, float(part))
+            return known[part]
+        if isinstance(part, tuple):
+            return tuple(map(converted, cast("tuple[Any, ...]", part)))
+        if isinstance(part, dict):
+            return {key: converted(entry) for key, entry in cast("dict[Any, Any]", part).items()}
+        if not dataclasses.is_dataclass(part) or isinstance(part, type):
+            return part
+        other = copy.copy(part)
+        for entry in dataclasses.fields(part):
+            object.__setattr__(other, entry.name, converted(getattr(part, entry.name)))
+        return other
+
+    return converted(value)
+
+
+def with_formula(
+    field: FieldType, expression: Callable[[Vec3], tuple[Real, Vec3]], name: str | None = None
+) -> FieldType:
+    """A copy of a field whose formula is the `ExpressionFormula` of f and grad f at points."""
+    other = copy.copy(field)
+    formula = ExpressionFormula(name or type(field).__name__, expression)
+    object.__setattr__(other, "formula", formula)
+    return other
+
+
+def scaled_in_space(evaluator: Evaluator, size: Real) -> Callable[[Vec3], tuple[Real, Vec3]]:
+    """The value and the gradient of a field that scales with a size s of its own, f(p; s) = F(p/s),
+    as expressions that Dr.Jit can differentiate with respect to p and s.
+
+    evaluator: of the field with the value of s, which has second derivatives.
+    size: s, a number with derivatives.
+
+    With the value s0 of s and q = p s0/s, f(p; s) = f(q; s0) and grad f(p; s) = (s0/s) grad f(q;
+    s0). q and s0/s have the derivatives by s; those of f and grad f by q are their gradient and
+    Hessian at the value s0.
+    """
+
+    def expression(p: Vec3) -> tuple[Real, Vec3]:
+        """f and grad f at p."""
+        ratio = dr.detach(size) / size
+        q = p * ratio
+        gradient = Evaluator.differentiable_gradient(evaluator, q)
+        assert gradient is not None, "the evaluator has second derivatives"
+        return Evaluator.differentiable_value(evaluator, q), ratio * gradient
+
+    return expression
 
 
 def _is_drjit(value: Any) -> bool:

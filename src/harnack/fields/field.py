@@ -467,6 +467,7 @@ def _is_attachable(value: Any) -> bool:
     if isinstance(value, tuple | list):
         return all(map(_is_attachable, cast("Any", value)))
     is_known = dr.is_array_v(type(value)) or isinstance(value, Parametrized)
+    is_known = is_known or getattr(value, "keeps_derivatives", False)  # as terms of sums do
     return is_known or not has_derivatives(value)
 
 

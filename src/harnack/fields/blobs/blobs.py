@@ -10,7 +10,6 @@ Waals radii.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 import os
@@ -39,6 +38,7 @@ from harnack.fields.attached_arrays import (
     attached_array,
     host_array,
     separate_variable,
+    with_formula,
 )
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.blobs.blob_sums import (
@@ -184,10 +184,7 @@ class Blobs(Formula):
         blobs = self._upload(backend)
         records = self._attached_records(backend, blobs.records)
         blobs = dataclasses.replace(blobs, records=records)
-        other = copy.copy(self)
-        formula: Any = ExpressionFormula(type(self).__name__, blobs.differentiable_sums)
-        object.__setattr__(other, "formula", formula)
-        return other
+        return with_formula(self, blobs.differentiable_sums)
 
     def _attached_records(self, backend: Backend, records: RecordTable) -> RecordTable:
         """The table of the blobs' numbers with derivatives by the arguments of the constructor.
@@ -222,7 +219,7 @@ class Blobs(Formula):
         entries = dr.select(column < 3, center, 0)
         entries = dr.select(column == 6, 1 / (self.kernel.support * radius), entries)
         entries = dr.select(column == 7, self.kernel.amplitude * weight, entries)
-        return dataclasses.replace(records, buffer=dr.replace_grad(records.buffer, entries))
+        return records.with_derivatives(entries)
 
     def largest_gradient(self) -> float:
         """A bound of |grad f| everywhere. It is a sum of bounds of the single blobs' gradients:
