@@ -3,6 +3,7 @@ central differences in double precision, in forward and in reverse mode."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -29,6 +30,11 @@ MANY = {
     "radii": np.random.default_rng(2).uniform(0.1, 0.3, 80),
     "weights": np.random.default_rng(4).uniform(0.5, 1, 80),
 }
+WIDTHS = (3, 8, 8, 1)
+LAYERS = [
+    tuple(np.random.default_rng(m + 9 * k).normal(size=s) / k**0.5 for s in ((m, k), (m,)))
+    for k, m in itertools.pairwise(WIDTHS)
+]
 GROUPS = [2, 0, 2, 1]
 
 
@@ -69,6 +75,12 @@ def cases() -> Iterator[Any]:
         {"coefficients": series},
         lambda coefficients: hk.fields.FourierSeries(coefficients, hk.Box((-1,) * 3, (1,) * 3)),
     )
+    for activation in ("tanh", "softplus", ("sine", 2.0), ("elu", 0.8), "relu"):
+        yield (
+            f"a network {activation}",
+            {"layers": LAYERS},
+            lambda layers, a=activation: hk.Network(layers, activation=a, level=0.1),
+        )
     yield "a root", {"height": 1.2}, lambda height: hk.fields.RiemannSurface("sqrt", height=height)
 
 

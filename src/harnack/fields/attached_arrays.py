@@ -125,11 +125,13 @@ def opaque_numbers(value: Any, backend: Backend) -> Any:
 
 
 def with_formula(
-    field: FieldType, expression: Callable[[Vec3], tuple[Real, Vec3]], name: str | None = None
+    field: FieldType,
+    expression: Callable[[Vec3], tuple[Real, Vec3]],
+    value: Callable[[Vec3], Real] | None = None,
 ) -> FieldType:
-    """A copy of a field whose formula is the `ExpressionFormula` of f and grad f at points."""
+    """A copy of a field whose formula is the `ExpressionFormula` of these functions."""
     other = copy.copy(field)
-    formula = ExpressionFormula(name or type(field).__name__, expression)
+    formula = ExpressionFormula(type(field).__name__, expression, value)
     object.__setattr__(other, "formula", formula)
     return other
 
@@ -176,6 +178,7 @@ class ExpressionFormula:
     name: the name of the field's class, for messages.
     expression: a function of points p that returns f(p) and grad f(p) as expressions which Dr.Jit
         can differentiate with respect to p and to the field's numbers.
+    value: the same for f(p) alone; None where the other function costs no more.
 
     On Dr.Jit numbers the formula is f. On dual numbers the first derivatives follow by the chain
     rule: with coordinates x_k that have the derivatives x_k,j, those of f are the sums over k of
@@ -184,6 +187,7 @@ class ExpressionFormula:
 
     name: str
     expression: Callable[[Vec3], tuple[Real, Vec3]]
+    value: Callable[[Vec3], Real] | None = None
 
     def __call__(self, x: Any, y: Any, z: Any) -> Any:
         """f at coordinates.
@@ -193,7 +197,8 @@ class ExpressionFormula:
         """
         like = next((c for c in (x, y, z) if isinstance(c, FormulaNumber)), None)
         if like is None:
-            return self.expression(backend_of(x).Array3f(x, y, z))[0]
+            p = backend_of(x).Array3f(x, y, z)
+            return self.expression(p)[0] if self.value is None else self.value(p)
         if not isinstance(like, Dual):
             raise TypeError(f"with its numbers attached, {self.name} gives no ranges")
         coordinates = [like.coerce(c) for c in (x, y, z)]
