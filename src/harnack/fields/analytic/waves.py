@@ -142,8 +142,11 @@ class PlaneWave:
         _checked_number(self.amplitude, "the amplitude of a plane wave")
         _checked_number(self.phase, "the phase of a plane wave")
         vector: Any = as_triple(self.wave_vector, "the wave vector")
-        if not has_derivatives(self.wave_vector):
-            object.__setattr__(self, "wave_vector", vector)
+        if dr.is_array_v(cast("Any", type(self.wave_vector))):
+            vector = self.wave_vector if has_derivatives(self.wave_vector) else vector
+        else:
+            vector = tuple(_checked_number(k, "the wave vector") for k in self.wave_vector)
+        object.__setattr__(self, "wave_vector", vector)
 
 
 Term = WaveProduct | PlaneWave

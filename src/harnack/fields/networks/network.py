@@ -297,10 +297,11 @@ class Network(Field):
             return self.domain
         lower, upper = self.domain.bounds()
         half = 0.5001 * grid.cell_size
-        box = Box(
-            tuple(np.maximum(centers.min(axis=0) - half, lower).tolist()),
-            tuple(np.minimum(centers.max(axis=0) + half, upper).tolist()),
-        )
+        low = np.maximum(centers.min(axis=0) - half, lower)
+        high = np.minimum(centers.max(axis=0) + half, upper)
+        if (low >= high).any():  # the grid reaches a bit beyond the domain
+            return self.domain
+        box = Box(tuple(low.tolist()), tuple(high.tolist()))
         return box if isinstance(self.domain, Box) else self.domain & box
 
     def cells(self, levels: tuple[float, ...], across: int) -> OccupancyGrid:

@@ -118,7 +118,12 @@ class _Product(dr.CustomOp):
     def _of(self, x: Real, weights: Real) -> Real:
         """X W^T for other matrices of the same shapes."""
         n, m, k = self._shape
-        return _contract(self._backend, (x, k, 1), (weights, k, 1), (n, m, k))
+        index = self._backend.UInt32
+        place, rows = dr.arange(index, m * k), dr.opaque(index, m)
+        transposed = dr.gather(
+            self._backend.Float, weights, (place % rows) * dr.opaque(index, k) + place // rows
+        )
+        return _contract(self._backend, (x, k, 1), transposed, (n, m, k))
 
     def forward(self) -> None:
         """Compute the change of P."""
@@ -128,44 +133,52 @@ class _Product(dr.CustomOp):
     def backward(self) -> None:
         """Compute the derivatives by X and W."""
         n, m, k = self._shape
-        g = self.grad_out()
-        self.set_grad_in("x", _contract(self._backend, (g, m, 1), (self._weights, 1, k), (n, k, m)))
-        self.set_grad_in("weights", _contract(self._backend, (g, 1, m), (self._x, 1, k), (m, k, n)))
+        g, backend = self.grad_out(), self._backend
+        self.set_grad_in("x", _contract(backend, (g, m, 1), self._weights, (n, k, m)))
+        self.set_grad_in("weights", _contract(backend, (g, 1, m), self._x, (m, k, n)))
 
 
 def _contract(
-    backend: Backend,
-    left: tuple[Real, int, int],
-    right: tuple[Real, int, int],
-    sizes: tuple[int, int, int],
+    backend: Backend, left: tuple[Real, int, int], right: Real, sizes: tuple[int, int, int]
 ) -> Real:
-    """The matrix of the sums over i of left[a + i, ...] right[b + i, ...], row after row.
+    """The product A B of two matrices, row after row.
 
-    left, right: the numbers of a matrix, and the distances of entries from row to row of the
-        result (of the left one; of the right one, from column to column) and from term to term.
-    sizes: the numbers of rows, of columns and of terms. They are kernel parameters.
+    left: the numbers of A, and the distances of its entries from row to row and from column to
+        column.
+    right: the numbers of B, row after row.
+    sizes: the numbers of rows and of columns of the result, and of terms of its sums, which are the
+        columns of A. They are kernel parameters.
 
-    A few sums of many terms are cut into parts, for each of which there is a lane.
+    A lane computes up to eight neighboring entries of a row, for which it reads an entry of A and
+    neighbors in B for each term. A few sums of many terms are cut into parts, each with a lane.
     """
-    (x, x_row, x_term), (y, y_column, y_term) = left, right
-    rows, columns, count = sizes
+    (a, row_step, term_step), (rows, columns, count) = left, sizes
     index, real = backend.UInt32, backend.Float
-    parts = max(1, min(count // 64, _MIN_LANES // max(1, rows * columns)))
-    length = -(-count // parts)  # rounded up
-    u = [dr.opaque(index, n) for n in (columns, count, length, x_row, x_term, y_column, y_term)]
-    columns_, count_, length_, x_row_, x_term_, y_column_, y_term_ = u
-    lane = dr.arange(index, rows * columns * parts)
+    at_once = next(size for size in (8, 4, 2, 1) if columns % size == 0)
+    packets = columns // at_once
+    parts = max(1, min(count // 64, _MIN_LANES // max(1, rows * packets)))
+    numbers = (count, -(-count // parts), packets, row_step, term_step)
+    count_, length, packets_, row_step_, term_step_ = (dr.opaque(index, n) for n in numbers)
+    lane = dr.arange(index, rows * packets * parts)
     cell, part = (lane // parts, lane % parts) if parts > 1 else (lane, index(0))
-    first = part * length_
-    end = dr.minimum(first + length_, count_)
-    x_start, y_start = (cell // columns_) * x_row_, (cell % columns_) * y_column_
+    end = dr.minimum((part + 1) * length, count_)
+    row, packet = cell // packets_, cell % packets_
+    # Reading several numbers at once needs evaluated arrays.
+    dr.eval(a, right)
 
-    def add(i: Any, total: Any) -> tuple[Any, Any]:
-        """The sum with term i."""
-        factor = dr.gather(real, x, x_start + i * x_term_)
-        return i + 1, dr.fma(factor, dr.gather(real, y, y_start + i * y_term_), total)
+    def add(i: Any, *sums: Any) -> tuple[Any, ...]:
+        """The sums with term i."""
+        factor = dr.gather(real, a, row * row_step_ + i * term_step_)
+        place = i * packets_ + packet
+        if at_once == 1:
+            return i + 1, dr.fma(factor, dr.gather(real, right, place), sums[0])
+        entries = dr.gather(backend.ArrayXf, right, place, shape=(at_once, 1))
+        return i + 1, *(dr.fma(factor, entries[j], sums[j]) for j in range(at_once))
 
-    _, total = dr.while_loop(
-        (first, dr.zeros(real, dr.width(lane))), lambda i, _: i < end, add, label="matrix product"
+    zeros = [dr.zeros(real, dr.width(lane)) for _ in range(at_once)]
+    _, *sums = dr.while_loop(
+        (part * length, *zeros), lambda i, *_: i < end, add, label="matrix product"
     )
-    return dr.block_sum(total, parts) if parts > 1 else total
+    if parts > 1:
+        sums = [dr.block_sum(total, parts) for total in sums]
+    return sums[0] if at_once == 1 else dr.ravel(backend.ArrayXf(sums))
