@@ -364,7 +364,7 @@ class WaveRounding:
 
 def _is_zero(bound: Any) -> bool:
     """Whether a bound is the Python number 0. (A number on a backend is not known.)"""
-    return isinstance(bound, float) and bound == 0
+    return isinstance(bound, float) and bound == 0.0
 
 
 def _wave_vector(term: Term) -> tuple[float, ...]:

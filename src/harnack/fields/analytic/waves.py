@@ -150,7 +150,7 @@ class PlaneWave:
 
 
 Term = WaveProduct | PlaneWave
-TermType = TypeVar("TermType", WaveProduct, PlaneWave, WaveFactor)
+TermType = TypeVar("TermType", bound=WaveProduct | PlaneWave | WaveFactor)
 
 
 def with_numbers(

@@ -206,9 +206,9 @@ class Network(Field):
         differs from it by less than exp(-20)/beta.
 
         module: the module. Its weights are copied: later changes of it change nothing here, and
-            nothing can be differentiated by them. For that, pass dict(module.named_parameters()) to
-            a function that `harnack.io.wrap_for_torch` has wrapped, and make a `Network` of it
-            there.
+            nothing can be differentiated by them. For that, pass module.parameters() one by one to
+            a function that `harnack.io.wrap_for_torch` has wrapped, and there make a `Network` of a
+            mapping of them by their names.
         domain, level: as of `Network`.
 
         Raises:
@@ -242,7 +242,8 @@ class Network(Field):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         has_cells = bool(plan.levels) and plan.ray_count >= _MIN_RAYS and self._is_relu
         levels = plan.levels if has_cells and self._fine_cells is not None else ()
-        return _NetworkEvaluator(self, plan, self._fine_cells, *self._upload(backend, levels))
+        data = self._upload(backend, levels)
+        return _NetworkEvaluator(self, plan, self._fine_cells, self._activations, *data)
 
     def with_attached_numbers(self, backend: Backend) -> Network:
         """The copy whose formula has derivatives by weights and biases."""
@@ -383,7 +384,8 @@ def _checked_layers(pairs: list[Any]) -> tuple[Layer, ...]:
                 f"{'coordinate' if index == 0 else 'value of the layer before'}, not "
                 f"{weights.shape}"
             )
-        if bias.shape == () and dr.is_array_v(type(pair[1])):  # a Dr.Jit array of one number
+        kind: Any = type(cast("Any", pair)[1])
+        if bias.shape == () and dr.is_array_v(kind):  # a Dr.Jit array of one number
             bias = bias.reshape(1)
         if bias.shape != (len(weights),):
             raise ValueError(
@@ -445,6 +447,7 @@ class _NetworkEvaluator(Evaluator):
     field: the network.
     plan: what it is used for.
     fine_cells: the number of fine cells across the domain for many rays; None for no such cells.
+    activations: those of all layers but the last.
     tables: the weights.
     lipschitz: a Lipschitz constant of f everywhere.
     size: the diagonal of the domain.
@@ -454,6 +457,7 @@ class _NetworkEvaluator(Evaluator):
     field: Network
     plan: Plan
     fine_cells: int | None
+    activations: tuple[Activation, ...]
     tables: LayerTables
     lipschitz: Real
     size: Real
@@ -514,7 +518,7 @@ class _NetworkEvaluator(Evaluator):
             (upload_floats(backend, weights.ravel()), upload_floats(backend, bias))
             for weights, bias in self.field.layers
         ]
-        return network_gradient(backend, layers, self.field._activations, p)
+        return network_gradient(backend, layers, self.activations, p)
 
     def occupied_cells(self) -> OccupancyGrid | None:
         cells = self.fine_cells

@@ -24,7 +24,7 @@ import drjit as dr
 from harnack.fields.networks.layer_tables import INPUTS
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
     from harnack.fields.networks.activations import Activation
 
 __all__ = ["DifferentiableLayer", "network_gradient", "network_value"]
@@ -175,10 +175,12 @@ def _contract(
         entries = dr.gather(backend.ArrayXf, right, place, shape=(at_once, 1))
         return i + 1, *(dr.fma(factor, entries[j], sums[j]) for j in range(at_once))
 
+    def has_more(i: Any, *_: Any) -> Mask:
+        """Whether there is a term i."""
+        return i < end
+
     zeros = [dr.zeros(real, dr.width(lane)) for _ in range(at_once)]
-    _, *sums = dr.while_loop(
-        (part * length, *zeros), lambda i, *_: i < end, add, label="matrix product"
-    )
+    _, *sums = dr.while_loop((part * length, *zeros), has_more, add, label="matrix product")
     if parts > 1:
         sums = [dr.block_sum(total, parts) for total in sums]
     return sums[0] if at_once == 1 else dr.ravel(backend.ArrayXf(sums))
