@@ -384,7 +384,7 @@ def _checked_layers(pairs: list[Any]) -> tuple[Layer, ...]:
                 f"{'coordinate' if index == 0 else 'value of the layer before'}, not "
                 f"{weights.shape}"
             )
-        kind: Any = type(cast("Any", pair)[1])
+        kind = cast("Any", type(cast("Any", pair)[1]))
         if bias.shape == () and dr.is_array_v(kind):  # a Dr.Jit array of one number
             bias = bias.reshape(1)
         if bias.shape != (len(weights),):
