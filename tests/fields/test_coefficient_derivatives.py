@@ -229,3 +229,14 @@ def test_all_classes_are_tested() -> None:
         assert set(kind.traits.differentiable_arguments) <= tested[kind], kind
     text = str([case.id for case in CASES])
     assert all(name in text for name in ACTIVATIONS)
+
+
+def test_clearance_of_a_domain_that_moves_is_refused() -> None:
+    size = Float64(1.2)
+    dr.enable_grad(size)
+    ray = Array3f64(1.3, 0, 3), Array3f64(0, 0, -1)
+    moving = hk.Gyroid(size), hk.SphericalHarmonic(3, 1, radius=size) - 0.1
+    for field in moving:
+        with pytest.raises(NotImplementedError, match="domain of this"):
+            hk.trace(field, *ray, clearance=True)
+    hk.trace(hk.Gyroid(size, domain=hk.Ball()), *ray, clearance=True)

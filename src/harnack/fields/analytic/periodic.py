@@ -479,6 +479,7 @@ class _CubicSurface(EigenfunctionSum):
         """
         self._wavenumber = _wavenumber(cell)
         self.cell = as_real(cell, "cell")
+        self.domain_moves = domain is None and is_attached(self)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
 
     def with_attached_numbers(self, backend: Backend) -> EigenfunctionSum:

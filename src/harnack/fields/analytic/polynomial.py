@@ -426,6 +426,7 @@ class SphericalHarmonic(_SolidHarmonics):
         if abs(m) > l:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
         domain = Ball(radius=as_real(radius, "the radius"))
+        self.domain_moves = is_attached(self)
         self.l, self.m = l, m
         low, high = range_of_harmonic(l, m)
         # The range of the constant Y_00 is its value; of all others, the range on the unit sphere.
