@@ -84,7 +84,8 @@ class FourierSeries(Field):
     accuracy. So does a function that is very steep far from the surface: compress it first, for
     example by tanh.
 
-    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24.
+    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24. Values,
+        gradients and hits can be differentiated by them if they are a Dr.Jit tensor.
     box: a finite `Box`.
 
     Promises (proved bounds of f near a point): bounds of the second derivatives (`CosineBounds` has

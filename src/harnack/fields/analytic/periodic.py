@@ -222,7 +222,9 @@ class EigenfunctionSum(Field):
     cosh(kappa_i w) f_i is harmonic in four dimensions, where w is the fourth coordinate; the sum of
     these is the harmonic extension of f.
 
-    terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length.
+    terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length. Values,
+        gradients and hits can be differentiated by their numbers that are Dr.Jit numbers, if terms
+        is a list or tuple.
     domain: the volume in which f is drawn; by default the ball about the origin whose radius is the
         longest wavelength.
 

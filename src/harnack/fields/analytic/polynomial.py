@@ -445,7 +445,8 @@ class HarmonicPolynomial(_SolidHarmonics):
     12. It is evaluated as a sum of solid harmonics.
 
     coefficients: {(i, j, k): c}, for the sum of c x^i y^j z^k; the paper's Eq. 8 is
-        HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
+        HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}). Values, gradients and hits can be
+        differentiated by those that are Dr.Jit numbers.
     domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
     The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The sum of solid harmonics
