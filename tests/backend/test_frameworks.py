@@ -388,9 +388,9 @@ def test_tensors_on_the_cpu_are_rays_like_numpy_arrays() -> None:
     "made",
     [
         lambda r: hk.expression(lambda x, y, z: x * x + y * y + z * z - r.array),
-        lambda r: hk.Blobs(r * POINTS.astype(np.float32), 0.5),
+        lambda r: hk.fields.HRBF(r * POINTS.astype(np.float32), POINTS),
     ],
-    ids=["expression", "blobs"],
+    ids=["expression", "HRBF"],
 )
 def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> None:
     def first_hits(r: Any) -> Any:
