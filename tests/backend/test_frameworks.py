@@ -388,9 +388,9 @@ def test_tensors_on_the_cpu_are_rays_like_numpy_arrays() -> None:
     "made",
     [
         lambda r: hk.expression(lambda x, y, z: x * x + y * y + z * z - r.array),
-        lambda r: hk.Blobs(r * POINTS.astype(np.float32), 0.5),
+        lambda r: hk.fields.HRBF(r * POINTS.astype(np.float32), POINTS),
     ],
-    ids=["expression", "blobs"],
+    ids=["expression", "HRBF"],
 )
 def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> None:
     def first_hits(r: Any) -> Any:
@@ -404,3 +404,27 @@ def test_fields_of_learned_numbers_are_refused(framework: str, made: Any) -> Non
 
     with pytest.raises(NotImplementedError, match="which carry derivatives"):
         differentiated()
+
+
+def test_networks_and_their_gradients_have_the_derivatives_of_torch() -> None:
+    torch.manual_seed(0)
+    linear, softplus = torch.nn.Linear, torch.nn.Softplus
+    module = torch.nn.Sequential(linear(3, 12), softplus(), linear(12, 5), softplus(), linear(5, 1))
+    module = module.double()
+    names, weights = zip(*module.named_parameters(), strict=True)
+
+    @hk.io.wrap_for_torch
+    def both(points: Any, *weights: Any) -> Any:
+        field = hk.Network(dict(zip(names, weights, strict=True)), activation="softplus")
+        return field.value(points), field.gradient(points)
+
+    points = torch.tensor(POINTS, requires_grad=True)
+    value, gradient = both(points, *weights)
+    expected = module(points)[:, 0]
+    (slopes,) = torch.autograd.grad(expected.sum(), points, create_graph=True)
+    factors = torch.randn_like(slopes)
+    variables = (points, *weights)
+    ours = torch.autograd.grad(value.sum() + (gradient * factors).sum(), variables)
+    theirs = torch.autograd.grad(expected.sum() + (slopes * factors).sum(), variables)
+    for a, b in zip((value, gradient, *ours), (expected, slopes, *theirs), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-12)

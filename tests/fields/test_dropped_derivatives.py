@@ -144,11 +144,19 @@ GIVEN: dict[str, Any] = {
     "max_crossings": 2,
 }
 # What results have derivatives by, or do not depend on: where rays begin and end moves no hit.
-WITH_DERIVATIVES = {("Surface", "field"), ("Surface", "level")} | {
-    (name, argument)
-    for name in ("trace", "crossings")
-    for argument in ("surface", "origins", "directions", "level", "t_min", "t_max")
-}
+WITH_DERIVATIVES = (
+    {("Surface", "field"), ("Surface", "level")}
+    | {
+        (name, argument)
+        for name in ("trace", "crossings")
+        for argument in ("surface", "origins", "directions", "level", "t_min", "t_max")
+    }
+    | {
+        (name, argument)
+        for name in ("sine_factor", "cosine_factor")
+        for argument in ("frequency", "phase")
+    }
+)
 # Functions of any numbers, of solids, and of scenes and files, whose results carry nothing; and
 # those of names and of surfaces that are already checked.
 OTHERS = {

@@ -52,6 +52,7 @@ FIELD_ROOMS = (
     "batch_evaluation",
     "evaluator",
     "attached_numbers",
+    "attached_arrays",
     "field",
     "formula_evaluator",
     "vm_formulas",

@@ -92,6 +92,17 @@ class RecordTable:
         """The memory in bytes of a table of so many records of `width` numbers, with padding."""
         return records * -(-width // PACKET) * PACKET * np.dtype(backend.dtype).itemsize
 
+    def with_derivatives(self, entries: Real) -> RecordTable:
+        """Return the table with the derivatives of `entries`, all numbers row after row with
+        padding, for sums by `for_each` that are differentiated with respect to them.
+
+        Reverse mode adds up the derivatives of the buffer in the loop. Dr.Jit 1.5 may read them too
+        early if they are passed on to a gather as they are, and loses some now and then; a
+        multiplication waits for the loop.
+        """
+        one = dr.opaque(self.backend.Float, 1)  # a product with a literal would be none
+        return replace(self, buffer=dr.replace_grad(self.buffer, entries * one))
+
     def view(self, first: Any, trips: Any) -> RecordTable:
         """Return a part of the table: `trips` consecutive records, from record `first` on. Both
         numbers may differ between lanes. An iteration of `for_each` must read a single record.
@@ -121,7 +132,13 @@ class RecordTable:
         return numbers
 
     def for_each(
-        self, body: RecordBody, state: LoopValues, label: str, active: Mask = True
+        self,
+        body: RecordBody,
+        state: LoopValues,
+        label: str,
+        active: Mask = True,
+        *,
+        is_sum: bool = False,
     ) -> LoopValues:
         """Apply `body` to all records in turn, on active lanes only, and return the final state.
 
@@ -130,6 +147,9 @@ class RecordTable:
         state: a tuple of arrays.
         label: the name of the loop in Dr.Jit's output.
         active: mask of the lanes on which the loop runs; other lanes keep their state.
+        is_sum: whether the state is a tuple of sums: `body` adds numbers to it that do not depend
+            on it. Then Dr.Jit can run the loop backwards, and the sums can be differentiated in
+            reverse mode with respect to the table and to all that `body` uses.
 
         A packet of lanes, which a processor computes together, skips the loop if all of its lanes
         are inactive.
@@ -152,4 +172,6 @@ class RecordTable:
 
         # The index of the iteration comes before the state, and is dropped at the end.
         start = (self.backend.UInt32(0), *state)
-        return dr.while_loop(start, is_active, read_and_apply, label=label)[1:]
+        return dr.while_loop(
+            start, is_active, read_and_apply, label=label, max_iterations=-1 if is_sum else None
+        )[1:]

@@ -36,6 +36,7 @@ __all__ = [
     "gradient_with_parameters",
     "has_own_formula",
     "own_formula",
+    "refuse_moving_domain",
     "value_with_parameters",
     "with_attached_arguments",
 ]
@@ -85,16 +86,33 @@ def gradient_with_parameters(field: Any, evaluator: Evaluator, p: Vec3) -> Vec3 
     try:
         result = coordinates[0].coerce(formula(*coordinates))
     except TypeError:  # it accepts ranges of derivatives alone
-        return None
+        return None if ATTACHED in vars(field) else evaluator.differentiable_gradient(p)
     gradient = type(p)(*(0 * p.x + entry for entry in result.first_derivatives))
     with dr.suspend_grad():
         value = evaluator.evaluate(dr.detach(p)).gradient
     return dr.replace_grad(value, gradient)
 
 
+def refuse_moving_domain(field: Any) -> None:
+    """Raise NotImplementedError if the domain of a field, or of a term or factor of it, follows
+    from numbers with derivatives (its attribute `domain_moves`), for what depends on where the
+    domain ends: how this moves is not known."""
+    if getattr(field, "domain_moves", False):
+        raise NotImplementedError(
+            f"the domain of this {type(field).__name__} moves with a number that carries "
+            "derivatives, and these lack that motion: detach the number, or give a domain of your "
+            "own where the class takes one"
+        )
+    for name in ("terms", "factors"):
+        for part in getattr(field, "__dict__", {}).get(name, ()):
+            if hasattr(part, "traits"):
+                refuse_moving_domain(part)
+
+
 def _formula_of_attached(field: Any, p: Vec3) -> Callable[[Any, Any, Any], Any]:
     """The formula of a field with its numbers attached, on the backend of points p."""
-    own_formula(field)  # raises an error if a user's class has another function
+    if hasattr(field, "formula"):
+        own_formula(field)  # raises an error if a user's class has another function
     return attached(field, backend_of(p)).formula
 
 

@@ -126,8 +126,9 @@ class Traits:
         parameters that are Dr.Jit arrays. If not, the constructor refuses arguments with
         derivatives enabled.
     differentiable_arguments: the names of arguments of the constructor by whose numbers f can be
-        differentiated, because its formula uses them as they are (`fields.attached_numbers`):
-        Dr.Jit numbers, or fields made of such. The constructor refuses other arguments with
+        differentiated, because its formula uses them as they are (`fields.attached_numbers`), or
+        it gives expressions of them (`fields.attached_arrays`): Dr.Jit numbers and arrays, or
+        fields made of such. The constructor refuses other arguments with
         derivatives enabled.
     """
 
@@ -467,6 +468,7 @@ def _is_attachable(value: Any) -> bool:
     if isinstance(value, tuple | list):
         return all(map(_is_attachable, cast("Any", value)))
     is_known = dr.is_array_v(type(value)) or isinstance(value, Parametrized)
+    is_known = is_known or getattr(value, "keeps_derivatives", False)  # as terms of sums do
     return is_known or not has_derivatives(value)
 
 

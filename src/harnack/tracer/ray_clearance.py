@@ -24,7 +24,7 @@ from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.elementary import clamp, fmax, fmin, max_norm
 from harnack.backend.elementary import safe_norm as norm
 from harnack.backend.loops import compute_on_active, loop_while_active
-from harnack.fields.attached_numbers import gradient_with_parameters
+from harnack.fields.attached_numbers import gradient_with_parameters, refuse_moving_domain
 from harnack.fields.capabilities import EXACT
 from harnack.tracer.derivatives import (
     change_of_nearest_level,
@@ -62,8 +62,10 @@ def validate_clearance(surface: TracedSurface, options: TraceOptions) -> None:
     Raises:
         ValueError: only the largest component is traced, as e is small beside the others, too; or
             another device traces the rays.
-        NotImplementedError: the field jumps at facets, or is a union of patches.
+        NotImplementedError: the field jumps at facets, or is a union of patches; or derivatives
+            are enabled on numbers that move its domain.
     """
+    refuse_moving_domain(surface.field)
     if options.backend is not None:
         raise ValueError(
             f'clearance=True is not measured with backend="{options.backend}": leave out one of '

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
@@ -371,8 +371,27 @@ class CosineSums:
         """The angles (u, v, w) of points p in radians; on the box they are from 0 to pi."""
         return (self.backend.Array3f(p) - self.lower) * self.rate
 
-    def value(self, p: Vec3) -> tuple[Real, Vec3]:
-        """Return the value and the gradient of the cosine series at points p."""
+    def with_coefficients(self, coefficients: Real) -> CosineSums:
+        """Return the series with coefficients that have derivatives.
+
+        coefficients: a_ijk in the order of i, j and k, of the same values.
+
+        Entry n of the row of i is a_ijk with n = 1 + j K_z + k; the last row, i = 0, is the first.
+        """
+        along_x, along_y, along_z = self.shape
+        in_plane, width = along_y * along_z, 8 * self.rows.packets_per_record
+        position = dr.arange(self.backend.UInt32, along_x * width)
+        i, column = along_x - 1 - position // width, position % width
+        is_coefficient = (column > 0) & (column <= in_plane)
+        index = dr.select(is_coefficient, i * in_plane + column - 1, 0)
+        entries = dr.gather(self.backend.Float, coefficients, index, is_coefficient)
+        return replace(self, rows=self.rows.with_derivatives(entries))
+
+    def value(self, p: Vec3, *, is_sum: bool = False) -> tuple[Real, Vec3]:
+        """Return the value and the gradient of the cosine series at points p.
+
+        is_sum: whether they can be differentiated in reverse mode (`RecordTable.for_each`).
+        """
         angles = self.angles(p)
         y_waves, z_waves = _waves(angles.y, self.shape[1]), _waves(angles.z, self.shape[2])
 
@@ -395,7 +414,8 @@ class CosineSums:
 
         real = self.backend.Float
         # (gx, gy, gz) is the gradient by the angles.
-        total, gx, gy, gz = self.rows.for_each(add, tuple(real(0) for _ in range(4)), "cosines")
+        start = tuple(real(0) for _ in range(4))
+        total, gx, gy, gz = self.rows.for_each(add, start, "cosines", is_sum=is_sum)
         return total, self.rate * self.backend.Array3f(gx, gy, gz)
 
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:

@@ -19,15 +19,22 @@ import numpy as np
 from harnack.backend.validation import as_real_array
 from harnack.fields.analytic.cosine_series import CosineBounds, CosineSums, fit_cosines, midpoints
 from harnack.fields.analytic.waves import mean_wavelength
+from harnack.fields.attached_arrays import (
+    attached_array,
+    host_array,
+    separate_variable,
+    with_formula,
+)
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
+from harnack.fields.parameters import kept_arguments
 from harnack.geometry.clip_volumes import Box
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from harnack.backend import Backend, FloatArray, Vec3
+    from harnack.backend import Backend, FloatArray, Real, Vec3
     from harnack.geometry.volume import Volume
 
 __all__ = ["FourierSeries", "SurfaceDisplacement"]
@@ -77,7 +84,8 @@ class FourierSeries(Field):
     accuracy. So does a function that is very steep far from the surface: compress it first, for
     example by tanh.
 
-    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24.
+    coefficients: (K_x, K_y, K_z) the a_ijk; each of the three sizes is at most 24. Values,
+        gradients and hits can be differentiated by them if they are a Dr.Jit tensor.
     box: a finite `Box`.
 
     Promises (proved bounds of f near a point): bounds of the second derivatives (`CosineBounds` has
@@ -91,7 +99,7 @@ class FourierSeries(Field):
             without size.
     """
 
-    traits = Traits(over_relaxation=1.5)
+    traits = Traits(over_relaxation=1.5, differentiable_arguments=("coefficients",))
 
     fit_error: float | None = None
     """The largest sampled difference of values between series and function; None for a series made
@@ -100,7 +108,7 @@ class FourierSeries(Field):
     def __init__(self, coefficients: Any, box: Box | tuple[Any, Any]) -> None:
         """Check the coefficients (K_x, K_y, K_z) and the box, and compute proved bounds of the
         series."""
-        checked = as_real_array(coefficients, "coefficients").astype(np.float64)
+        checked = host_array(coefficients, "coefficients")
         if checked.ndim != 3 or 0 in checked.shape:
             raise ValueError(f"coefficients must have shape (K_x, K_y, K_z), not {checked.shape}")
         _check_terms(checked.shape)
@@ -282,6 +290,17 @@ class FourierSeries(Field):
         return CosineSums.upload(
             backend, self.coefficients, self._lower, self._size, self._bounds, self._rounding
         )
+
+    def with_attached_numbers(self, backend: Backend) -> FourierSeries:
+        """The copy whose formula has derivatives by the coefficients."""
+        argument = kept_arguments(self)["coefficients"]
+        coefficients = attached_array(argument, self.coefficients, backend)
+        series = self._upload(backend).with_coefficients(coefficients)
+
+        def expression(p: Vec3) -> tuple[Real, Vec3]:
+            return series.value(separate_variable(p), is_sum=True)
+
+        return with_formula(self, expression)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The box around all cells in which the series may take one of the levels; the whole box if

@@ -28,9 +28,11 @@ from harnack.fields.analytic.solid_harmonics import (
     hessian,
 )
 from harnack.fields.analytic.sphere_bounds import BallRange, range_of_harmonic
+from harnack.fields.attached_arrays import scaled_in_space, with_formula
+from harnack.fields.attached_numbers import attached_vector
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Sample, Traits
-from harnack.fields.parameters import record_call
+from harnack.fields.parameters import kept_arguments, record_call
 from harnack.geometry.clip_volumes import Ball
 from harnack.name_suggestions import is_one_of
 
@@ -91,7 +93,7 @@ class Lobes(Field):
         TypeError: l or m is no integer.
     """
 
-    traits = Traits(over_relaxation=1.6)
+    traits = Traits(over_relaxation=1.6, differentiable_arguments=("scale",))
 
     def __init__(self, l: int, m: int, *, scale: float = 1.0, sign: LobeSign = "both") -> None:  # noqa: E741
         """Set up the lobes of a single spherical harmonic, Y_lm. The class describes the arguments
@@ -161,7 +163,14 @@ class Lobes(Field):
 
     def _only(self, sign: LobeSign) -> Lobes:
         """The lobes of the same Y and scale where Y has this sign."""
-        return Lobes.combined(self.weights, scale=self.scale, sign=sign)
+        scale = kept_arguments(self).get("scale", self.scale)  # one with derivatives is refused
+        return Lobes.combined(self.weights, scale=scale, sign=sign)
+
+    def with_attached_numbers(self, backend: Backend) -> Lobes:
+        """The copy whose formula has derivatives by the scale: f is that of the scale 1 at p/scale
+        (`_LobesEvaluator`)."""
+        (scale,) = attached_vector([kept_arguments(self)["scale"]], [self.scale], backend)
+        return with_formula(self, scaled_in_space(self.evaluator(backend), scale))
 
     @property
     def degree(self) -> int:

@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.validation import as_real, as_triple, check_no_derivatives
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.analytic.rounding import WaveRounding
 from harnack.fields.analytic.waves import (
@@ -38,9 +39,13 @@ from harnack.fields.analytic.waves import (
     hessian_of_terms,
     mean_wavelength,
     sine_factor,
+    with_numbers,
 )
+from harnack.fields.attached_arrays import opaque_numbers, scaled_in_space, with_formula
+from harnack.fields.attached_numbers import attached_vector
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
+from harnack.fields.field import Field, Sample, Traits, is_attached, validate_levels_in_range
+from harnack.fields.parameters import differentiable_parameters, kept_arguments
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -190,7 +195,7 @@ class ExtensionBounds:
         at_critical_point = (1 + alpha * weight) * (rise * x - f) + weight * spread
         # The case Dx <= f: the bound is D - f or, if D < 2E, E + D^2/(4E) - f.
         near_rise = rise
-        if spread > 0:
+        if not isinstance(spread, float) or spread > 0:  # or a number of a backend
             near_rise = dr.select(rise < 2 * spread, spread + rise * rise / (4 * spread), rise)
         return fmin(fmax(at_critical_point, near_rise - f), self.largest)
 
@@ -217,7 +222,9 @@ class EigenfunctionSum(Field):
     cosh(kappa_i w) f_i is harmonic in four dimensions, where w is the fourth coordinate; the sum of
     these is the harmonic extension of f.
 
-    terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length.
+    terms: `WaveProduct` and `PlaneWave` terms; frequencies in radians per unit length. Values,
+        gradients and hits can be differentiated by their numbers that are Dr.Jit numbers, if terms
+        is a list or tuple.
     domain: the volume in which f is drawn; by default the ball about the origin whose radius is the
         longest wavelength.
 
@@ -246,11 +253,14 @@ class EigenfunctionSum(Field):
         ValueError: terms that are not finite, or a sum that is constant.
     """
 
-    traits = Traits(is_global=True, is_cheap=True)
+    traits = Traits(is_global=True, is_cheap=True, differentiable_arguments=("terms",))
 
     def __init__(self, terms: Iterable[Term], *, domain: Volume | None = None) -> None:
         """Check the terms, and compute their bounds and the default domain."""
-        self.terms = checked_terms(terms)
+        listed = tuple(terms)
+        if not is_attached(self):  # numbers of what is no list or tuple would be lost
+            check_no_derivatives(type(self).__name__, listed)
+        self.terms = checked_terms(listed)
         self.waves = self._bounds()
         longest = 2 * math.pi / min(self.waves.wavenumbers)
         min_wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
@@ -288,12 +298,35 @@ class EigenfunctionSum(Field):
         return self.waves.largest_curvature
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The evaluator of f. As it holds Python numbers only, it is the same for every backend and
-        every plan (what the evaluator is used for)."""
-        del backend, plan
-        return _WaveSumEvaluator(
+        """The evaluator of f, for every plan (what the evaluator is used for). It holds Python
+        numbers, which are the same for every backend; unless derivatives by them are wanted, so
+        that they change from step to step and should compile nothing."""
+        del plan
+        numbers: Any = (
             self.terms, self.waves, self._extension, self._rounding, self._rounding_bound
-        )
+        )  # fmt: skip
+        if is_attached(self):
+            numbers = opaque_numbers(numbers, backend)
+        return _WaveSumEvaluator(*numbers)
+
+    def with_attached_numbers(self, backend: Backend) -> EigenfunctionSum:
+        """The copy whose formula has derivatives by the numbers of the terms."""
+        terms: Any = kept_arguments(self).get("terms", self.terms)
+
+        def number(value: Any) -> Any:
+            return attached_vector([value], [as_real(value, "a number")], backend)[0]
+
+        def triple(value: Any) -> tuple[Any, Any, Any]:
+            x, y, z = attached_vector(value, as_triple(value, "the wave vector"), backend)
+            return x, y, z
+
+        attached_terms = [with_numbers(term, number, triple) for term in terms]
+
+        def expression(p: Vec3) -> tuple[Real, Vec3]:
+            value, gradient = evaluate_terms(attached_terms, p)
+            return value, type(p)(*gradient)
+
+        return with_formula(self, expression)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level outside of the proved range of f."""
@@ -334,6 +367,8 @@ class EigenfunctionSum(Field):
             its steepest, the wall is thicker.
         level: the level in the middle of the wall, by default `default_level`.
         """
+        # The bound depends on the numbers of the terms, and is one of Python.
+        check_no_derivatives("levels_of_thickness", differentiable_parameters(self))
         return self.wall_levels(0.5 * self.max_gradient * float(thickness), level=level)
 
     def describe(self) -> dict[str, Any]:
@@ -419,9 +454,9 @@ def _wavenumber(cell: Any) -> float:
     Raises:
         TypeError, ValueError: cell is not a positive finite number.
     """
-    if not isinstance(cell, numbers.Real):
+    if not (isinstance(cell, numbers.Real) or dr.is_array_v(type(cell))):
         raise TypeError(f"the edge length of the cell must be a number, not {cell!r}")
-    edge = float(cell)
+    edge = as_real(cell, "the edge length of the cell")
     if not 0 < edge < math.inf:
         raise ValueError(f"the edge length of the cell must be positive, not {cell!r}")
     return 2 * math.pi / edge
@@ -435,6 +470,7 @@ class _CubicSurface(EigenfunctionSum):
     _steepness: a bound of |grad f| for cell 2 pi.
     """
 
+    traits = dataclasses.replace(EigenfunctionSum.traits, differentiable_arguments=("cell",))
     _largest_value: float
     _steepness: float
 
@@ -443,9 +479,15 @@ class _CubicSurface(EigenfunctionSum):
 
         domain: the volume in which f is drawn; None for the ball of radius `cell` about the origin.
         """
-        self.cell = float(cell)
         self._wavenumber = _wavenumber(cell)
+        self.cell = as_real(cell, "cell")
+        self.domain_moves = domain is None and is_attached(self)
         super().__init__(terms, domain=Ball(radius=self.cell) if domain is None else domain)
+
+    def with_attached_numbers(self, backend: Backend) -> EigenfunctionSum:
+        """The copy whose formula has derivatives by the cell, with which f scales."""
+        (cell,) = attached_vector([kept_arguments(self)["cell"]], [self.cell], backend)
+        return with_formula(self, scaled_in_space(self.evaluator(backend), cell))
 
     def _bounds(self) -> WaveBounds:
         """Proved bounds of the sum of waves and of its derivatives. The bounds of |f| and |grad f|

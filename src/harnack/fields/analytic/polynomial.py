@@ -11,6 +11,9 @@ second derivatives. The paper is Gillespie, Yang, Botsch and Crane 2024.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import functools
 import math
 import numbers
 import operator
@@ -22,6 +25,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.validation import as_real
 from harnack.enclosures import HarmonicBall, Lipschitz, Promise, TaylorRemainder
 from harnack.fields.analytic.rounding import HarmonicRounding
 from harnack.fields.analytic.solid_harmonics import (
@@ -42,8 +46,11 @@ from harnack.fields.analytic.sphere_bounds import (
     range_of_harmonic,
     value_bound,
 )
+from harnack.fields.attached_arrays import opaque_numbers, scaled_in_space, with_formula
+from harnack.fields.attached_numbers import attached_vector
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Sample, Traits, validate_levels_in_range
+from harnack.fields.field import Field, Sample, Traits, is_attached, validate_levels_in_range
+from harnack.fields.parameters import kept_arguments
 from harnack.geometry.clip_volumes import Ball
 
 if TYPE_CHECKING:
@@ -77,6 +84,7 @@ class HarmonicPromises:
     degree, lowest_degree: the largest degree of a term, and the smallest degree above 0.
     order: the order to which f minus its constant term vanishes along the z axis.
     center_radius, boundary_radius: radii of harmonic balls at r = 0 and r = 1.
+    is_larger_outside: whether the second is larger than the first.
     axis_share: if rho is less than this fraction of r, rho determines the radius of the ball.
     axial: three bounds, of |f| without the constant term, of the gradient and of the Hessian, in
         powers of rho and r, if the order is 3 or more; else None.
@@ -101,6 +109,7 @@ class HarmonicPromises:
     order: int
     center_radius: float
     boundary_radius: float
+    is_larger_outside: bool
     axis_share: float
     axial: tuple[AxialBound, AxialBound, AxialBound] | None
     rounding: HarmonicRounding
@@ -140,6 +149,7 @@ class HarmonicPromises:
             order,
             center_radius,
             boundary_radius,
+            center_radius < boundary_radius,
             axis_share,
             axial_bounds,
             HarmonicRounding.of(weights, is_divided=is_divided),
@@ -249,7 +259,7 @@ class HarmonicPromises:
         if self.lowest_degree < 3:
             # Never below the smaller of the two radii: proportional to r if that is the radius at
             # the center, else falling linearly in r.
-            if self.center_radius < self.boundary_radius:
+            if self.is_larger_outside:
                 return fmax(self.boundary_radius * r, self.center_radius)
             return fmax(
                 dr.fma(r, self.boundary_radius - self.center_radius, self.center_radius),
@@ -313,10 +323,14 @@ class _SolidHarmonics(Field):
         return max(degree for degree, _ in self._weights)
 
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
-        """The evaluator of f. As it holds Python numbers only, it is the same for every backend and
-        every plan (what the evaluator is used for)."""
-        del backend, plan
-        return _SolidHarmonicsEvaluator(self._weights, self._axis, self._size, self._promises)
+        """The evaluator of f, for every plan (what the evaluator is used for). It holds Python
+        numbers, which are the same for every backend; unless derivatives by them are wanted, so
+        that they change from step to step and should compile nothing."""
+        del plan
+        numbers: Any = (self._weights, self._axis, self._size, self._promises)
+        if is_attached(self):
+            numbers = opaque_numbers(numbers, backend)
+        return _SolidHarmonicsEvaluator(*numbers)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level outside of the proved range of f in its domain."""
@@ -402,6 +416,8 @@ class SphericalHarmonic(_SolidHarmonics):
         TypeError: l or m is no integer.
     """
 
+    traits = dataclasses.replace(_SolidHarmonics.traits, differentiable_arguments=("radius",))
+
     def __init__(self, l: int, m: int, *, radius: float = 1.0) -> None:  # noqa: E741
         """Check the arguments, and set up the sum of solid harmonics with this single term."""
         l, m = degree_and_order((l, m))  # noqa: E741
@@ -409,12 +425,19 @@ class SphericalHarmonic(_SolidHarmonics):
             raise ValueError(f"the degree l must be 0 to {LARGEST_DEGREE}, not {l}")
         if abs(m) > l:
             raise ValueError(f"the order m must be -l to l, here -{l} to {l}, not {m}")
-        domain = Ball(radius=radius)
+        domain = Ball(radius=as_real(radius, "the radius"))
+        self.domain_moves = is_attached(self)
         self.l, self.m = l, m
         low, high = range_of_harmonic(l, m)
         # The range of the constant Y_00 is its value; of all others, the range on the unit sphere.
         known = BallRange(low, ()) if l == 0 else BallRange(0.0, ((l, low, high),))
         super().__init__({(l, m): 1.0}, known, domain.radius, domain)
+
+    def with_attached_numbers(self, backend: Backend) -> SphericalHarmonic:
+        """The copy whose formula has derivatives by the radius, with which f scales."""
+        argument = kept_arguments(self)["radius"]
+        (radius,) = attached_vector([argument], [self._size], backend)
+        return with_formula(self, scaled_in_space(self.evaluator(backend), radius))
 
 
 class HarmonicPolynomial(_SolidHarmonics):
@@ -422,7 +445,8 @@ class HarmonicPolynomial(_SolidHarmonics):
     12. It is evaluated as a sum of solid harmonics.
 
     coefficients: {(i, j, k): c}, for the sum of c x^i y^j z^k; the paper's Eq. 8 is
-        HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}).
+        HarmonicPolynomial({(2, 1, 0): 1, (0, 1, 2): -1}). Values, gradients and hits can be
+        differentiated by those that are Dr.Jit numbers.
     domain: the bounded volume to which it is clipped; by default the ball of radius 1.
 
     The Laplacian must vanish, up to 1e-9 of the terms that cancel in it. The sum of solid harmonics
@@ -434,6 +458,8 @@ class HarmonicPolynomial(_SolidHarmonics):
             above 12, a coefficient is not finite, or the domain is unbounded.
         TypeError: coefficients is no dictionary.
     """
+
+    traits = dataclasses.replace(_SolidHarmonics.traits, differentiable_arguments=("coefficients",))
 
     def __init__(
         self, coefficients: Mapping[tuple[int, int, int], float], *, domain: Volume | None = None
@@ -462,6 +488,27 @@ class HarmonicPolynomial(_SolidHarmonics):
         axis = max((2, 0, 1), key=lambda axis: order_on_axis(weights_by_axis[axis]))
         weights = weights_by_axis[axis]
         super().__init__(weights, BallRange.of(weights), size, domain, axis)
+
+    def with_attached_numbers(self, backend: Backend) -> HarmonicPolynomial:
+        """The copy whose formula, the sum of c x^i y^j z^k, has derivatives by the coefficients c,
+        those that are 0 included. (The sum of solid harmonics is more accurate, and has the value
+        alone.)"""
+        other = copy.copy(self)
+        terms = [
+            (powers, attached_vector([c], [as_real(c, "a coefficient")], backend)[0])
+            for powers, c in kept_arguments(self)["coefficients"].items()
+        ]
+
+        def formula(x: Any, y: Any, z: Any) -> Any:
+            """The sum of c x^i y^j z^k."""
+            total = x * 0.0
+            for powers, c in terms:
+                factors = [v**n for v, n in zip((x, y, z), powers, strict=True) if n]
+                total = total + functools.reduce(operator.mul, [*factors, c])
+            return total
+
+        object.__setattr__(other, "formula", formula)
+        return other
 
 
 def _rotate_axes(values: Sequence[Any], n: int) -> tuple[Any, Any, Any]:
@@ -492,15 +539,17 @@ def _checked(coefficients: Any) -> dict[tuple[int, int, int], float]:
             raise ValueError(f"{powers!r} is no exponent (i, j, k) of x^i y^j z^k") from None
         if min(i, j, k) < 0:
             raise ValueError(f"exponents must not be negative: {powers!r}")
-        if not (isinstance(value, numbers.Real) and math.isfinite(value)):
+        is_array = dr.is_array_v(type(value))
+        number = as_real(value, f"the coefficient of {powers!r}") if is_array else value
+        if not (isinstance(number, numbers.Real) and math.isfinite(number)):
             raise ValueError(f"the coefficient of {powers!r} is {value!r}, not a finite number")
         if i + j + k > LARGEST_DEGREE:
             raise ValueError(
                 f"{_monomial((i, j, k))} has degree {i + j + k}: at most {LARGEST_DEGREE} is "
                 "supported"
             )
-        if value != 0:
-            checked[i, j, k] = float(value)
+        if number != 0:
+            checked[i, j, k] = float(number)
     if not checked:
         raise ValueError("a harmonic polynomial needs a coefficient that is not zero")
     remainder, worst = laplacian(checked)

@@ -20,7 +20,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, max_norm
-from harnack.backend.validation import as_finite
+from harnack.backend.validation import as_finite, check_no_derivatives
 from harnack.enclosures import Enclosure, HarmonicBall, Lipschitz, SlopeRange, TaylorRemainder
 from harnack.enclosures.extremum import BranchPointEnclosure, BranchSample, NearestBranchEnclosure
 from harnack.enclosures.parabola import ParabolaEnclosure
@@ -28,8 +28,11 @@ from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.analytic.branches import Branches, Disk, PlaneSegment, complex_of, derivatives
 from harnack.fields.analytic.plane import copied_arguments, make_branches
+from harnack.fields.attached_arrays import with_formula
+from harnack.fields.attached_numbers import attached_vector
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, Traits
+from harnack.fields.parameters import kept_arguments
 from harnack.geometry.clip_volumes import Ball, Box, VolumeIntersection
 
 if TYPE_CHECKING:
@@ -161,7 +164,7 @@ class RiemannSurface(Field):
             missing; or the function is invalid.
     """
 
-    traits = Traits(is_global=True)
+    traits = Traits(is_global=True, differentiable_arguments=("height",))
 
     def __init__(
         self,
@@ -182,7 +185,7 @@ class RiemannSurface(Field):
         if as_finite(height, "height") == 0:
             raise ValueError("height must be a factor other than 0")
         self.part = part
-        self.height = float(height)
+        self.height = as_finite(height, "height")
         self._branch_arguments = copied_arguments(
             function=function,
             exponent=exponent,
@@ -200,6 +203,9 @@ class RiemannSurface(Field):
         self._shift = None if shift is None else abs(self.height) * shift
         self._is_single = self.branches.count == 1
         self.traits = dataclasses.replace(self.traits, has_creases=not self._is_single)
+        if self._shift is not None:
+            # The heights of all sheets move, each by its number of periods.
+            check_no_derivatives("a RiemannSurface with a period", height)
         if self._is_single:
             self.period = self._shift  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -217,6 +223,30 @@ class RiemannSurface(Field):
         if shift is not None and not self._is_single:
             shift = dr.opaque(backend.Float, shift)
         return _RiemannSurfaceEvaluator(branches, self.part, height, shift, self._is_single)
+
+    def with_attached_numbers(self, backend: Backend) -> RiemannSurface:
+        """The copy whose formula has derivatives by the factor `height`.
+
+        With the height h of a point, f = s (h - H u) with the factor H, whose value is H0, the
+        nearest branch u and a sign s, which is the derivative of f by z. So for the field f0 with
+        the factor H0, f = s h + (H/H0) (f0 - s h), and the derivatives of f by x and y are H/H0
+        times those of f0.
+        """
+        evaluator = self.evaluator(backend)
+        (height,) = attached_vector([kept_arguments(self)["height"]], [self.height], backend)
+
+        def expression(p: Vec3) -> tuple[Real, Vec3]:
+            value = Evaluator.differentiable_value(evaluator, p)
+            gradient = Evaluator.differentiable_gradient(evaluator, p)
+            if gradient is None:
+                gradient = evaluator.evaluate(dr.detach(p)).gradient
+                message = "the gradient of a RiemannSurface of branches without second derivatives"
+                check_no_derivatives(message, p)
+            ratio, upright = height / dr.detach(height), dr.detach(gradient.z) * p.z
+            value = upright + ratio * (value - upright)
+            return value, type(p)(ratio * gradient.x, ratio * gradient.y, gradient.z)
+
+        return with_formula(self, expression)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         """The part of the domain between the lowest and the highest height that the level sets can

@@ -19,7 +19,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import drjit as dr
 import numpy as np
@@ -340,9 +340,9 @@ class WaveRounding:
         # Entry 0 of a bound is a constant, entries 1 to 3 are factors of |x|, |y| and |z|.
         value, slope = self.value[0], self.gradient[0]
         for axis in range(3):
-            if self.move[axis] > 0:
+            if not _is_zero(self.move[axis]):
                 value = value + self.move[axis] * abs_p[axis] * dr.abs(gradient[axis])
-            if self.value[axis + 1] > 0:
+            if not _is_zero(self.value[axis + 1]):
                 value = value + self.value[axis + 1] * abs_p[axis]
                 slope = slope + self.gradient[axis + 1] * abs_p[axis]
         roundoff = float(dr.epsilon(type(p.x)))
@@ -360,6 +360,11 @@ class WaveRounding:
             return roundoff * (parts[0] + sum(terms, 0 * p.x))
 
         return at(self.slopes), at(self.hessian)
+
+
+def _is_zero(bound: Any) -> bool:
+    """Whether a bound is the Python number 0. (A number on a backend is not known.)"""
+    return isinstance(bound, float) and bound == 0.0
 
 
 def _wave_vector(term: Term) -> tuple[float, ...]:

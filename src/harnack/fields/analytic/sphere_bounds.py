@@ -443,7 +443,7 @@ class BallRange:
         (l-1) .. (l-order+1) M_l s^(l-order), by Horner's rule, where M_l is the largest |f_l| on
         the unit sphere."""
         total = 0.0 * s
-        max_abs = {degree: max(-low, high) for degree, low, high in self.ends}
+        max_abs = {degree: fmax(-low, high) for degree, low, high in self.ends}
         for degree in range(max(max_abs, default=0), order - 1, -1):
             total = total * s + math.perm(degree, order) * max_abs.get(degree, 0.0)
         return total

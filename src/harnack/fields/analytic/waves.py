@@ -7,16 +7,24 @@ of plane waves."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
+import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
 from harnack.backend.elementary import sincos
-from harnack.backend.validation import as_finite, as_triple, check_no_derivatives, no_derivatives
+from harnack.backend.validation import (
+    as_finite,
+    as_real,
+    as_triple,
+    check_no_derivatives,
+    has_derivatives,
+)
 
 if TYPE_CHECKING:
     from harnack.backend import Real, Vec3
@@ -47,26 +55,38 @@ class WaveFactor:
     frequency: float
     phase: float
     is_cosine: bool
+    keeps_derivatives: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Check the numbers, and convert them to Python floats."""
-        check_no_derivatives("a factor of a wave", vars(self))
+        """Check the numbers, and convert those without derivatives to Python floats."""
         for name in ("frequency", "phase"):
             object.__setattr__(
-                self, name, as_finite(getattr(self, name), f"the {name} of a factor")
+                self, name, _checked_number(getattr(self, name), f"the {name} of a factor")
             )
-        if self.frequency == 0:
+        if as_real(self.frequency, "the frequency") == 0:
             raise ValueError("a factor of frequency 0 is a constant: multiply the amplitude by it")
 
 
-@no_derivatives
+def _checked_number(value: Any, name: str) -> Any:
+    """A finite number as a Python float; a Dr.Jit number with derivatives as it is.
+
+    Raises:
+        TypeError, ValueError: it is no finite number.
+        NotImplementedError: it is a number of another library with derivatives.
+    """
+    number = as_finite(value, name)
+    if dr.is_array_v(cast("Any", type(value))) and has_derivatives(value):
+        return value
+    check_no_derivatives(name, value)
+    return number
+
+
 def sine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
     """The factor sin(frequency * coordinate + phase) of a product of waves. frequency is in radians
     per unit length, phase in radians."""
     return WaveFactor(frequency, phase, False)
 
 
-@no_derivatives
 def cosine_factor(frequency: float = 1.0, phase: float = 0.0) -> WaveFactor:
     """The factor cos(frequency * coordinate + phase) of a product of waves. frequency is in radians
     per unit length, phase in radians."""
@@ -86,11 +106,11 @@ class WaveProduct:
     x: WaveFactor | None = None
     y: WaveFactor | None = None
     z: WaveFactor | None = None
+    keeps_derivatives: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Check the amplitude and the factors."""
-        check_no_derivatives("a Product", vars(self))
-        as_finite(self.amplitude, "the amplitude of a product")
+        _checked_number(self.amplitude, "the amplitude of a product")
         for name in "xyz":
             factor = getattr(self, name)
             if factor is not None and not isinstance(factor, WaveFactor):
@@ -114,38 +134,63 @@ class PlaneWave:
     amplitude: float
     wave_vector: tuple[float, float, float]
     phase: float = 0.0
+    keeps_derivatives: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Check the numbers, and convert the wave vector to a tuple of three floats."""
-        check_no_derivatives("a PlaneWave", vars(self))
-        as_finite(self.amplitude, "the amplitude of a plane wave")
-        as_finite(self.phase, "the phase of a plane wave")
-        vector = as_triple(self.wave_vector, "the wave vector")
+        """Check the numbers, and convert the wave vector to a tuple of three floats, unless it has
+        derivatives."""
+        _checked_number(self.amplitude, "the amplitude of a plane wave")
+        _checked_number(self.phase, "the phase of a plane wave")
+        vector: Any = as_triple(self.wave_vector, "the wave vector")
+        if dr.is_array_v(cast("Any", type(self.wave_vector))):
+            vector = self.wave_vector if has_derivatives(self.wave_vector) else vector
+        else:
+            vector = tuple(_checked_number(k, "the wave vector") for k in self.wave_vector)
         object.__setattr__(self, "wave_vector", vector)
 
 
 Term = WaveProduct | PlaneWave
+TermType = TypeVar("TermType", bound=WaveProduct | PlaneWave | WaveFactor)
+
+
+def with_numbers(
+    term: TermType, number: Callable[[Any], Any], triple: Callable[[Any], tuple[Any, Any, Any]]
+) -> TermType:
+    """A copy of a term with the function `number` of each of its numbers in place of these, and
+    the function `triple` of its wave vector."""
+    other = copy.copy(term)
+    for name in ("amplitude", "frequency", "phase"):
+        if hasattr(term, name):
+            object.__setattr__(other, name, number(getattr(term, name)))
+    if isinstance(term, PlaneWave):
+        object.__setattr__(other, "wave_vector", triple(term.wave_vector))
+    if isinstance(term, WaveProduct):
+        for axis, factor in term.factors:
+            object.__setattr__(other, "xyz"[axis], with_numbers(factor, number, triple))
+    return other
 
 
 def checked_terms(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """The terms as a tuple, checked, and with Python floats as amplitudes and phases.
+    """The terms as a tuple, checked, and with Python floats in place of all numbers.
 
     Raises:
         ValueError, TypeError: there is no term, or a term is invalid; the message names the first
             invalid term.
     """
-    listed, checked = tuple(terms), list[Term]()
+    listed = tuple(terms)
     if not listed:
         raise ValueError("a sum needs at least one term")
     for n, term in enumerate(listed):
-        if isinstance(term, PlaneWave):
-            amplitude, phase = float(term.amplitude), float(term.phase)
-            checked.append(replace(term, amplitude=amplitude, phase=phase))
-        elif isinstance(term, WaveProduct):  # pyright: ignore[reportUnnecessaryIsInstance]
-            checked.append(replace(term, amplitude=float(term.amplitude)))
-        else:
+        if not isinstance(term, WaveProduct | PlaneWave):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"term {n} must be a Product or a PlaneWave, not {term!r}")
-    return tuple(checked)
+    return tuple(
+        with_numbers(
+            term,
+            lambda value: as_real(value, "a number of a term"),
+            lambda value: as_triple(value, "the wave vector"),
+        )
+        for term in listed
+    )
 
 
 class _FactorEvaluator:
@@ -162,7 +207,8 @@ class _FactorEvaluator:
 
         axis: the index of the coordinate.
         """
-        key = (axis, factor.frequency, factor.phase)
+        numbers = (factor.frequency, factor.phase)
+        key = (axis, *(n if isinstance(n, float) else id(n) for n in numbers))
         if key not in self._sincos:
             self._sincos[key] = sincos(_angle(factor.frequency * self._p[axis], factor.phase))
         sine, cosine = self._sincos[key]
@@ -185,7 +231,7 @@ def evaluate_terms(terms: Sequence[Term], p: Vec3) -> tuple[Real, list[Real]]:
             sine, cosine = sincos(angle)
             value += term.amplitude * cosine
             for axis in range(3):
-                if k[axis] != 0:
+                if not _is_number(k[axis], 0):
                     gradient[axis] -= term.amplitude * k[axis] * sine
             continue
         # (axis, value, derivative) of each factor of a product.
@@ -213,7 +259,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
             angle = _angle(k[0] * p[0] + k[1] * p[1] + k[2] * p[2], term.phase)
             wave = term.amplitude * sincos(angle)[1]  # times the cosine
             for i, j in upper:
-                if k[i] * k[j] != 0:
+                if not (_is_number(k[i], 0) or _is_number(k[j], 0)):
                     upper[i, j] -= k[i] * k[j] * wave
             continue
         frequency = {axis: factor.frequency for axis, factor in term.factors}
@@ -236,7 +282,7 @@ def hessian_of_terms(terms: Sequence[Term], p: Vec3) -> list[list[Real]]:
 def _angle(angle: Real, phase: float) -> Real:
     """angle + phase; without the addition if the phase is 0, which saves an operation and its
     rounding."""
-    return angle + phase if phase else angle
+    return angle if _is_number(phase, 0) else angle + phase
 
 
 def _product(factors: Sequence[Real], amplitude: float) -> Real:
@@ -247,7 +293,12 @@ def _product(factors: Sequence[Real], amplitude: float) -> Real:
         product = factor if product is None else product * factor
     if product is None:
         return amplitude
-    return product if amplitude == 1.0 else amplitude * product
+    return product if _is_number(amplitude, 1) else amplitude * product
+
+
+def _is_number(value: Any, number: float) -> bool:
+    """Whether a value is a Python number, and this one. (A number on a backend is not known.)"""
+    return isinstance(value, float | int) and value == number
 
 
 @dataclass(frozen=True)

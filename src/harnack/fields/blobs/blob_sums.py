@@ -450,23 +450,27 @@ def _with_jumps(
     return dr.select(meets_support, low, 0), dr.select(meets_support, high, 0)
 
 
-def for_each_record(records: RecordTable, *, active: Mask = True) -> ForEach:
+def for_each_record(records: RecordTable, *, active: Mask = True, is_sum: bool = False) -> ForEach:
     """Make a function that loops over all records (rows of numbers of blobs) of a table. The
     function for_each(body, state) calls state = body(record, state) for each record and returns the
     last state.
 
     active: the lanes on which it loops; on all others the state stays as it is.
+    is_sum: whether the state is a tuple of sums, which can be differentiated in reverse mode
+        (`RecordTable.for_each`).
     """
 
     def for_each(body: EachBlob, state: State) -> State:
         """Call state = body(record, state) for all records, one after another. Returns the last
         state."""
-        return records.for_each(body, state, "blobs", active)
+        return records.for_each(body, state, "blobs", active, is_sum=is_sum)
 
     return for_each
 
 
-def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) -> ForEach:
+def for_each_listed(
+    records: RecordTable, entries: Any, begin: Any, end: Any, *, is_sum: bool = False
+) -> ForEach:
     """Make a function that loops over the records (rows of numbers of blobs) with the indices
     entries[begin:end]. The function for_each(body, state) calls state = body(record, state) for
     each of these records and returns the last state.
@@ -474,6 +478,7 @@ def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) ->
     records: the table of the records.
     entries: an array of indices of records.
     begin, end: positions in that array, which may differ from lane to lane.
+    is_sum: as of `for_each_record`.
     """
     kind = records.backend.UInt32
 
@@ -487,7 +492,13 @@ def for_each_listed(records: RecordTable, entries: Any, begin: Any, end: Any) ->
         def has_more(i: Any, *_: Any) -> Mask:
             return i < end
 
-        return dr.while_loop((kind(begin), *state), has_more, step, label="blobs of a cell")[1:]
+        return dr.while_loop(
+            (kind(begin), *state),
+            has_more,
+            step,
+            label="blobs of a cell",
+            max_iterations=-1 if is_sum else None,
+        )[1:]
 
     return for_each
 

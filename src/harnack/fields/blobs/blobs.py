@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import drjit as dr
 import numpy as np
 
+from harnack.arithmetic.jet import Dual
 from harnack.backend import FloatArray, IntArray, backend_of
 from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmin
@@ -32,6 +33,13 @@ from harnack.backend.validation import (
 )
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz, SlopeRange
 from harnack.enclosures.samples import Ray, RaySample, Sample
+from harnack.fields.attached_arrays import (
+    ExpressionFormula,
+    attached_array,
+    host_array,
+    separate_variable,
+    with_formula,
+)
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.blobs.blob_sums import (
     PIECES,
@@ -52,14 +60,16 @@ from harnack.fields.blobs.grid import BlobGrid, CellLists
 from harnack.fields.blobs.group_maximum import (
     GroupedList,
     GroupMaximumEnclosure,
+    for_each_of_group,
     group_maximum_at,
     group_maximum_jet,
+    largest_group_at,
 )
 from harnack.fields.blobs.kernels import BlobKernel, GaussianKernel, choose_kernel
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Plan
 from harnack.fields.formula import Formula
 from harnack.fields.formula_evaluator import FormulaEvaluator, is_jet
-from harnack.fields.parameters import record_arguments
+from harnack.fields.parameters import kept_arguments, record_arguments
 from harnack.files.molecules import Atoms, read_molecule
 from harnack.geometry import Box
 
@@ -96,11 +106,20 @@ class Blobs(Formula):
     Large numbers of blobs are kept in a uniform grid, whose cells list the blobs nearby, so that a
     sample reads only these.
 
+    Values, gradients and hits can be differentiated by centers, radii and weights that are Dr.Jit
+    arrays, vectors, tensors or lists of Dr.Jit numbers. With groups, a derivative is that of the
+    largest sum.
+
     Raises:
         BlobError: numbers that are not valid blobs (a ValueError).
     """
 
-    traits = dataclasses.replace(Formula.traits, is_cheap=False, is_larger_inside=True)
+    traits = dataclasses.replace(
+        Formula.traits,
+        is_cheap=False,
+        is_larger_inside=True,
+        differentiable_arguments=("centers", "radii", "weights"),
+    )
     default_level: float = 1.0
     period: ClassVar[float | None] = None
 
@@ -115,7 +134,7 @@ class Blobs(Formula):
     ) -> None:
         """Check the arguments, which the class describes (centers, radii, weights, kernel, groups).
         The blobs are sorted by groups."""
-        self.centers, self.radii, self.weights, self.groups = _checked(
+        self.centers, self.radii, self.weights, self.groups, self._order = _checked(
             centers, radii, weights, groups
         )
         self.kernel = choose_kernel(kernel)
@@ -152,9 +171,55 @@ class Blobs(Formula):
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at jets of the coordinates (intervals that contain values and derivatives), or at
-        Dr.Jit numbers. For jets the sum is over all blobs, because the grid serves only points."""
+        Dr.Jit numbers or dual numbers, as an expression that Dr.Jit can differentiate. For jets the
+        sum is over all blobs, because the grid serves only points."""
+        if isinstance(x, Dual):
+            blobs = self._upload(backend_of(x.value))
+            return ExpressionFormula(type(self).__name__, blobs.differentiable_sums)(x, y, z)
         number = backend_number(x, y, z) if is_jet(x, type(self).__name__) else x
         return self._upload(backend_of(number))(x, y, z)
+
+    def with_attached_numbers(self, backend: Backend) -> Blobs:
+        """The copy whose formula has derivatives by the arguments of the constructor."""
+        blobs = self._upload(backend)
+        records = self._attached_records(backend, blobs.records)
+        blobs = dataclasses.replace(blobs, records=records)
+        return with_formula(self, blobs.differentiable_sums)
+
+    def _attached_records(self, backend: Backend, records: RecordTable) -> RecordTable:
+        """The table of the blobs' numbers with derivatives by the arguments of the constructor.
+
+        In a record (`_blob_records`) the center c, one over the radius s R of the support, and the
+        amplitude w A are numbers of the arguments; what rounding has cut off of the center does not
+        depend on them. Lane 8 i + k is entry k of record i.
+        """
+        kept, count, index = kept_arguments(self), len(self), backend.UInt32
+        in_given_order = np.empty(count, np.int64)
+        in_given_order[self._order] = np.arange(count)
+
+        def numbers(name: str, plain: FloatArray) -> Real:
+            """The numbers of an argument, in the order in which they were given."""
+            argument = kept.get(name)
+            if argument is None:
+                argument = plain[in_given_order]
+            elif name != "centers" and np.ndim(host_array(argument, name)) == 0:
+                return attached_array(argument, plain[:1], backend)
+            return attached_array(argument, plain[in_given_order], backend)
+
+        centers = numbers("centers", self.centers)
+        radii, weights = numbers("radii", self.radii), numbers("weights", self.weights)
+        lane = dr.arange(index, 8 * count)
+        column, order = lane & 7, upload_integers(backend, self._order)
+        blob = dr.gather(index, order, lane >> 3)
+        real = backend.Float
+        center = dr.gather(real, centers, 3 * blob + dr.minimum(column, 2))
+        # (A single number for all blobs is an array of one entry.)
+        radius = dr.gather(real, radii, dr.minimum(blob, dr.width(radii) - 1))
+        weight = dr.gather(real, weights, dr.minimum(blob, dr.width(weights) - 1))
+        entries = dr.select(column < 3, center, 0)
+        entries = dr.select(column == 6, 1 / (self.kernel.support * radius), entries)
+        entries = dr.select(column == 7, self.kernel.amplitude * weight, entries)
+        return records.with_derivatives(entries)
 
     def largest_gradient(self) -> float:
         """A bound of |grad f| everywhere. It is a sum of bounds of the single blobs' gradients:
@@ -260,13 +325,37 @@ class _DeviceBlobs:
         # The list of all blobs.
         return group_maximum_jet(term, x, zero, self.grouped(None))
 
-    def near(self, p: Vec3) -> ForEach:
+    def differentiable_sums(self, p: Vec3) -> tuple[Real, Vec3]:
+        """f and grad f at points p, as expressions that Dr.Jit can differentiate with respect to p
+        and to the records.
+
+        Both are sums over blobs, f of A k(q) and grad f of -2 A k'(q) v/R with the vector v from p
+        to the center in units of the support's radius R, and q = |v|^2. Dr.Jit differentiates a
+        term, and runs the loop that adds the terms once more for reverse mode, since no term
+        depends on the sum. If there are groups, the terms are those of the largest sum.
+        """
+        p = separate_variable(p)
+        if self.groups is None:
+            for_each = self.near(p, is_sum=True)
+        else:
+            with dr.suspend_grad():
+                blobs = self.grouped(dr.detach(p))
+                group = largest_group_at(self.kernel, self.backend, dr.detach(p), blobs)
+            for_each = for_each_of_group(blobs, group)
+        sums = value_at(self.kernel, self.backend, p, for_each)
+        return sums.value, sums.gradient
+
+    def near(self, p: Vec3, *, is_sum: bool = False) -> ForEach:
         """Make a function that loops over the blobs whose supports may contain p: for_each(body,
         state) sets state = body(record, state) for each of them and returns the last state. They
-        are the blobs in the list of the grid cell that contains p or, without a grid, all blobs."""
+        are the blobs in the list of the grid cell that contains p or, without a grid, all blobs.
+
+        is_sum: whether the state is a tuple of sums, which can be differentiated in reverse mode.
+        """
         if self.grid is None:
-            return for_each_record(self.records)
-        return for_each_listed(self.records, self.grid.entries, *self.grid.list_at(p))
+            return for_each_record(self.records, is_sum=is_sum)
+        begin, end = self.grid.list_at(dr.detach(p))
+        return for_each_listed(self.records, self.grid.entries, begin, end, is_sum=is_sum)
 
     def grouped(self, p: Vec3 | None) -> GroupedList:
         """The blobs whose supports may contain p, as a list sorted by groups; all blobs if p is
@@ -475,15 +564,16 @@ def _zero_where(mask: Any, sums: SumValue) -> SumValue:
 
 def _checked(
     centers: Any, radii: Any, weights: Any, groups: Any
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None]:
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray | None, IntArray]:
     """The arguments of `Blobs` as arrays, sorted by groups: centers (n, 3), radii (n,), weights
     (n,) and groups (n,). Groups are numbered from 0 without gaps; None if none are given. In the
-    code these four arrays are c, r, w and g.
+    code these four arrays are c, r, w and g. The fifth result is the order (n,): the index that
+    each blob had in the arguments.
 
     Raises:
         BlobError: wrong shapes, or numbers that are not valid for a blob.
     """
-    c = as_real_array(centers, "centers", BlobError).astype(np.float64)
+    c = host_array(centers, "centers", BlobError)
     check_vectors(c, "centers", BlobError)
     if not len(c):
         raise BlobError("centers: there are none; give at least one blob")
@@ -496,7 +586,7 @@ def _checked(
     check_coordinate_size(r, BlobError)
     w = np.ones(len(c)) if weights is None else _numbers(weights, "weights", len(c))
     if groups is None:
-        return c, r, w, None
+        return c, r, w, None, np.arange(len(c))
     g = as_real_array(groups, "groups", BlobError)
     if g.shape != (len(c),) or g.dtype.kind not in "iu":
         raise BlobError(
@@ -508,6 +598,7 @@ def _checked(
         r[order],
         w[order],
         np.unique(g[order], return_inverse=True)[1],  # the groups' numbers from 0 without gaps
+        order,
     )
 
 
@@ -519,7 +610,7 @@ def _numbers(values: Any, name: str, count: int) -> FloatArray:
     Raises:
         BlobError: a wrong shape, or a number that is not finite.
     """
-    array = as_real_array(values, name, BlobError).astype(np.float64)
+    array = host_array(values, name, BlobError)
     if array.ndim == 0:
         array = np.full(count, float(array))
     if array.shape != (count,):
@@ -551,6 +642,8 @@ class Molecule(Blobs):
     Raises:
         FileFormatError: a file that does not hold a molecule.
     """
+
+    traits = dataclasses.replace(Blobs.traits, differentiable_arguments=())
 
     def __init__(
         self,

@@ -110,14 +110,14 @@ class _OneGroup:
     """
 
     def __init__(self, blobs: GroupedList, begin: Any) -> None:
-        self._blobs, self._begin = blobs, begin
+        self._blobs, self.begin = blobs, begin
         self.end: Any = None
 
     def __call__(self, body: EachBlob, state: State) -> State:
         """Set state = body(record, state) for all blobs of the group, one after another, where
         `record` is a blob's row of numbers. Returns the last state."""
         blobs = self._blobs
-        group = blobs.group(self._begin)
+        group = blobs.group(self.begin)
 
         def step(i: Any, *state: Any) -> State:
             return i + 1, *body(blobs.records.read_record(blobs.record(i)), state)
@@ -127,7 +127,7 @@ class _OneGroup:
 
         kind = blobs.records.backend.UInt32
         self.end, *final = dr.while_loop(
-            (kind(self._begin), *state), has_more, step, label="blobs of a group"
+            (kind(self.begin), *state), has_more, step, label="blobs of a group"
         )
         return tuple(final)
 
@@ -166,6 +166,54 @@ def group_maximum_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: Group
     is_zero = (groups < blobs.group_count) & ~(value > 0)
     gradient = dr.select(is_zero, backend.Array3f(0), backend.Array3f(x, y, z))
     return SumValue(dr.select(is_zero, 0, value), gradient, error, gradient_error)
+
+
+def largest_group_at(kernel: BlobKernel, backend: Backend, p: Vec3, blobs: GroupedList) -> Any:
+    """The index of the group whose sum is the largest at points p (3, n), of those that have a blob
+    in the list. A group without any has the sum 0; if that is the largest, the result is the number
+    of groups, which is the index of none.
+
+    kernel: the shape of all blobs.
+    blobs: the list of the blobs that may be nonzero at p.
+    """
+    real, index = backend.Float, backend.UInt32
+
+    def add_group(for_each: ForEach, state: State) -> State:
+        """Return the largest sum so far and the index of its group, with another group included."""
+        value, largest = state
+        sums = value_at(kernel, backend, p, for_each)
+        is_larger = sums.value > value
+        group = blobs.group(cast("_OneGroup", for_each).begin)
+        return dr.select(is_larger, sums.value, value), dr.select(is_larger, group, largest)
+
+    none = index(blobs.group_count)
+    groups, (value, largest) = blobs.each_group(add_group, (real(-dr.inf), none), "largest group")
+    return dr.select((groups < blobs.group_count) & ~(value > 0), none, largest)
+
+
+def for_each_of_group(blobs: GroupedList, group: Any) -> ForEach:
+    """Make a function that loops over the blobs of a list, with the amplitude 0 for those of other
+    groups than `group`, an index for each lane. The sums that it returns can be differentiated in
+    reverse mode (`RecordTable.for_each`)."""
+
+    def for_each(body: EachBlob, state: State) -> State:
+        """Set state = body(record, state) for all blobs, one after another, where `state` is a
+        tuple of sums. Returns the last state."""
+
+        def step(i: Any, *state: Any) -> State:
+            record = blobs.records.read_record(blobs.record(i))
+            record[7] = dr.select(blobs.group(i) == group, record[7], 0)
+            return i + 1, *body(record, state)
+
+        def has_more(i: Any, *_: Any) -> Mask:
+            return i < blobs.end
+
+        start = (blobs.records.backend.UInt32(blobs.begin), *state)
+        return dr.while_loop(
+            start, has_more, step, label="blobs of the largest group", max_iterations=-1
+        )[1:]
+
+    return for_each
 
 
 def group_maximum_jet(term: Term, like: Jet, zero: Real, blobs: GroupedList) -> Jet:

@@ -411,7 +411,8 @@ class CubicKernel(BlobKernel):
         return (1 - r) ** 2 * (1 + 2 * r)
 
     def profile(self, q: Real) -> tuple[Real, Real, Real]:
-        r = dr.sqrt(fmin(q, 1))
+        # At the center the root would have an infinite slope.
+        r = dr.sqrt(fmax(fmin(q, 1), float(dr.smallest(type(q)))))
         w = 1 - r
         k = w * w * dr.fma(2, r, 1)
         return k, -3 * w, k

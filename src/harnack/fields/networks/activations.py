@@ -66,6 +66,12 @@ class Activation(abc.ABC):
     def at(self, z: Real, parameter: Real) -> ActivationPoint:
         """The function at z. parameter: `parameter` on the device."""
 
+    def second(self, z: Real, parameter: Real) -> Real:
+        """The second derivative of the part g at z. parameter: `parameter` on the device. The
+        default is that of a part g that is 0."""
+        del parameter
+        return 0 * z
+
     @abc.abstractmethod
     def second_range(self, z: Real, below: Real, above: Real, parameter: Real) -> tuple[Real, Real]:
         """Bounds of the second derivative of the part g, from z - below to z + above.
@@ -157,6 +163,11 @@ class Tanh(Activation):
         value, slope = _tanh(z)
         return ActivationPoint(value, slope, 0 * z + 40 * unit, 0 * z + 80 * unit)
 
+    def second(self, z: Real, parameter: Real) -> Real:
+        del parameter
+        value, slope = _tanh(z)
+        return -2 * value * slope
+
     def second_range(self, z: Real, below: Real, above: Real, parameter: Real) -> tuple[Real, Real]:
         del parameter
         lower, upper = z - below, z + above
@@ -220,6 +231,11 @@ class Softplus(Activation):
         slope = dr.select(z < 0, w * inverse, inverse)
         return ActivationPoint(value, slope, error, 0 * z + 40 * unit)
 
+    def second(self, z: Real, parameter: Real) -> Real:
+        w = dr.exp(-dr.abs(parameter * z))
+        inverse = 1 / (1 + w)
+        return parameter * w * inverse * inverse
+
     def second_range(self, z: Real, below: Real, above: Real, parameter: Real) -> tuple[Real, Real]:
         lower, upper = z - below, z + above
         nearest = dr.select((lower <= 0) & (upper >= 0), 0, fmin(dr.abs(lower), dr.abs(upper)))
@@ -273,6 +289,9 @@ class ELU(Activation):
         error = dr.select(is_left, 24 * unit * parameter, 0)
         return ActivationPoint(value, dr.select(is_left, parameter * e, 1), error, error)
 
+    def second(self, z: Real, parameter: Real) -> Real:
+        return dr.select(z <= 0, parameter * dr.exp(fmin(z, 0)), 0)
+
     def second_range(self, z: Real, below: Real, above: Real, parameter: Real) -> tuple[Real, Real]:
         lower, upper = z - below, z + above
         slack = 64 * float(dr.epsilon(type(z)))
@@ -313,6 +332,9 @@ class Sine(Activation):
         sine, cosine = sincos(angle)
         error = unit * (4 + 2 * dr.abs(angle))
         return ActivationPoint(sine, parameter * cosine, error, parameter * (error + 2 * unit))
+
+    def second(self, z: Real, parameter: Real) -> Real:
+        return -parameter * parameter * sincos(parameter * z)[0]
 
     def second_range(self, z: Real, below: Real, above: Real, parameter: Real) -> tuple[Real, Real]:
         unit = float(dr.epsilon(type(z)))

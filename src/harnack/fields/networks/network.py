@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import drjit as dr
 import numpy as np
 
+from harnack.backend.arrays import upload_floats
 from harnack.backend.elementary import clamp, fmin, safe_norm
-from harnack.backend.validation import as_real_array, make_read_only
+from harnack.backend.validation import check_no_derivatives, make_read_only
 from harnack.enclosures import Lipschitz, SlopeRange
 from harnack.enclosures.parabola import ParabolaEnclosure
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import RaySample, Sample
+from harnack.fields.attached_arrays import attached_array, host_array, with_formula
 from harnack.fields.batched_fields import FieldCache, cached_upload
 from harnack.fields.clearance import occupied_cells
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
-from harnack.fields.field import Field, Traits, copies_numbers
+from harnack.fields.field import Field, Traits, copies_numbers, is_attached
 from harnack.fields.networks.activations import Activation, ReLU, activation_of
 from harnack.fields.networks.box_ranges import ranges_in_boxes
 from harnack.fields.networks.cell_networks import networks_of_cells
@@ -34,6 +37,8 @@ from harnack.fields.networks.layer_tables import (
 )
 from harnack.fields.networks.network_grid import NetworkGrid
 from harnack.fields.networks.torch_modules import layers_of_modules
+from harnack.fields.networks.weight_derivatives import network_gradient, network_value
+from harnack.fields.parameters import kept_arguments
 from harnack.geometry.clip_volumes import Box
 from harnack.tree.empty_space import OccupancyGrid
 
@@ -88,7 +93,9 @@ class Network(Field):
     size compiles nothing. In single precision the weights are rounded, which its errors include.
 
     layers: a sequence of pairs (W, b) of arrays (m, k) and (m,). The first k is 3, and the last m
-        is 1; there are at least two layers, of at most 4,096 values.
+        is 1; there are at least two layers, of at most 4,096 values. Or a mapping of such arrays by
+        names, as of `from_file`: the state_dict of a module of PyTorch, or its named_parameters.
+        Values, gradients and hits can be differentiated by arrays that are Dr.Jit tensors.
     activation: "relu", "tanh", "sine", "softplus" or "elu"; or a pair of such a name and its
         parameter: ("sine", w0) is sin(w0 z), with w0 = 30 by default, ("softplus", beta) is
         log(1 + exp(beta z))/beta, and ("elu", alpha) is alpha (exp z - 1) for z < 0, both with 1 by
@@ -109,16 +116,21 @@ class Network(Field):
         TypeError: layers that are no pairs of arrays of real numbers.
     """
 
+    traits = Traits(over_relaxation=1.0, differentiable_arguments=("layers",))
+
     def __init__(
         self,
-        layers: Sequence[tuple[Any, Any]],
+        layers: Sequence[tuple[Any, Any]] | Mapping[str, Any],
         *,
         activation: Any = "relu",
         domain: Volume | None = None,
         level: float = 0.0,
     ) -> None:
         """Check the layers, and compute a bound of the gradient."""
-        self.layers = _checked_layers(layers)
+        pairs = _pairs_of_layers(layers)
+        if not is_attached(self):  # numbers of what is no list, tuple or mapping would be lost
+            check_no_derivatives(type(self).__name__, pairs)
+        self.layers = _checked_layers(pairs)
         self.activation = activation
         self._activations = _checked_activations(activation, len(self.layers) - 1)
         self.domain = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)) if domain is None else domain
@@ -141,7 +153,7 @@ class Network(Field):
                 "squares of which overflow in single precision: scale the network"
             )
         kinks = any(entry.kink(entry.parameter) != 0 for entry in self._activations)
-        self.traits = Traits(over_relaxation=1.0, has_creases=kinks)
+        self.traits = dataclasses.replace(self.traits, has_creases=kinks)
         make_read_only(self.layers)
 
     @classmethod
@@ -194,7 +206,9 @@ class Network(Field):
         differs from it by less than exp(-20)/beta.
 
         module: the module. Its weights are copied: later changes of it change nothing here, and
-            nothing can be differentiated by them.
+            nothing can be differentiated by them. For that, pass module.parameters() one by one to
+            a function that `harnack.io.wrap_for_torch` has wrapped, and there make a `Network` of a
+            mapping of them by their names.
         domain, level: as of `Network`.
 
         Raises:
@@ -228,7 +242,24 @@ class Network(Field):
     def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
         has_cells = bool(plan.levels) and plan.ray_count >= _MIN_RAYS and self._is_relu
         levels = plan.levels if has_cells and self._fine_cells is not None else ()
-        return _NetworkEvaluator(self, plan, self._fine_cells, *self._upload(backend, levels))
+        data = self._upload(backend, levels)
+        return _NetworkEvaluator(self, plan, self._fine_cells, self._activations, *data)
+
+    def with_attached_numbers(self, backend: Backend) -> Network:
+        """The copy whose formula has derivatives by weights and biases."""
+        arguments = _pairs_of_layers(kept_arguments(self)["layers"])
+        layers = [
+            (attached_array(w, weights, backend), attached_array(b, bias, backend))
+            for (w, b), (weights, bias) in zip(arguments, self.layers, strict=True)
+        ]
+
+        def value(p: Vec3) -> Real:
+            return network_value(backend, layers, self._activations, p)
+
+        def expression(p: Vec3) -> tuple[Real, Vec3]:
+            return value(p), network_gradient(backend, layers, self._activations, p)
+
+        return with_formula(self, expression, value)
 
     @cached_upload
     def _upload(
@@ -267,10 +298,11 @@ class Network(Field):
             return self.domain
         lower, upper = self.domain.bounds()
         half = 0.5001 * grid.cell_size
-        box = Box(
-            tuple(np.maximum(centers.min(axis=0) - half, lower).tolist()),
-            tuple(np.minimum(centers.max(axis=0) + half, upper).tolist()),
-        )
+        low = np.maximum(centers.min(axis=0) - half, lower)
+        high = np.minimum(centers.max(axis=0) + half, upper)
+        if (low >= high).any():  # the grid reaches a bit beyond the domain
+            return self.domain
+        box = Box(tuple(low.tolist()), tuple(high.tolist()))
         return box if isinstance(self.domain, Box) else self.domain & box
 
     def cells(self, levels: tuple[float, ...], across: int) -> OccupancyGrid:
@@ -319,13 +351,19 @@ class Network(Field):
         }
 
 
-def _checked_layers(layers: Any) -> tuple[Layer, ...]:
-    """The layers as arrays of double precision. Raises the errors of `Network`."""
+def _pairs_of_layers(layers: Any) -> list[Any]:
+    """The pairs of weights and bias of the argument `layers` of `Network`."""
+    if isinstance(layers, Mapping):
+        return list(_layers_of_names(dict(cast("Mapping[str, Any]", layers)), "the mapping"))
     if isinstance(layers, str | bytes) or not isinstance(layers, Iterable):
         raise TypeError(
             f"layers is a sequence of pairs (weights, bias) of arrays, not {type(layers).__name__}"
         )
-    pairs: list[Any] = list(cast("Iterable[Any]", layers))
+    return list(cast("Iterable[Any]", layers))
+
+
+def _checked_layers(pairs: list[Any]) -> tuple[Layer, ...]:
+    """The layers as arrays of double precision. Raises the errors of `Network`."""
     if len(pairs) < 2:
         raise ValueError(f"a network needs at least two layers, not {len(pairs)}")
     checked: list[Layer] = []
@@ -337,7 +375,7 @@ def _checked_layers(layers: Any) -> tuple[Layer, ...]:
                 f"{name} is no pair (weights, bias): layers = [(W0, b0), (W1, b1), ...]"
             )
         weights, bias = (
-            np.array(as_real_array(part, f"{what} of {name}", type_error=TypeError), np.float64)
+            host_array(part, f"{what} of {name}", type_error=TypeError)
             for part, what in zip(cast("Sequence[Any]", pair), ("weights", "bias"), strict=True)
         )
         if weights.ndim != 2 or weights.shape[1] != before or len(weights) == 0:
@@ -346,6 +384,9 @@ def _checked_layers(layers: Any) -> tuple[Layer, ...]:
                 f"{'coordinate' if index == 0 else 'value of the layer before'}, not "
                 f"{weights.shape}"
             )
+        kind = cast("Any", type(cast("Any", pair)[1]))
+        if bias.shape == () and dr.is_array_v(kind):  # a Dr.Jit array of one number
+            bias = bias.reshape(1)
         if bias.shape != (len(weights),):
             raise ValueError(
                 f"the bias of {name} must have shape ({len(weights)},), not {bias.shape}"
@@ -406,6 +447,7 @@ class _NetworkEvaluator(Evaluator):
     field: the network.
     plan: what it is used for.
     fine_cells: the number of fine cells across the domain for many rays; None for no such cells.
+    activations: those of all layers but the last.
     tables: the weights.
     lipschitz: a Lipschitz constant of f everywhere.
     size: the diagonal of the domain.
@@ -415,6 +457,7 @@ class _NetworkEvaluator(Evaluator):
     field: Network
     plan: Plan
     fine_cells: int | None
+    activations: tuple[Activation, ...]
     tables: LayerTables
     lipschitz: Real
     size: Real
@@ -467,6 +510,15 @@ class _NetworkEvaluator(Evaluator):
         # The whole network: a ball may be larger than a cell.
         bounds = cast("tuple[BallBound, ...]", expand(self.tables, p, [radius], None).bounds)
         return bounds[0].gradient_change
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3:
+        """grad f at p as an expression that Dr.Jit can differentiate with respect to p."""
+        backend = self.tables.backend
+        layers = [
+            (upload_floats(backend, weights.ravel()), upload_floats(backend, bias))
+            for weights, bias in self.field.layers
+        ]
+        return network_gradient(backend, layers, self.activations, p)
 
     def occupied_cells(self) -> OccupancyGrid | None:
         cells = self.fine_cells
