@@ -109,7 +109,8 @@ def boundary_motion(
     x = np.where(is_front[:, None], before.position, behind.position)
     other = np.where(is_front[:, None], behind.position, before.position)
     g, directions = _gradients(tracer, x), film.directions(jumps.middle)
-    sine = np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
+    with np.errstate(invalid="ignore"):  # normals of facets are no gradients
+        sine = np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
     width = film.pixel_width(x)
     resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
     near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
