@@ -20,13 +20,18 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import as_positive
+from harnack.backend.validation import as_positive, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, TaylorRemainder
 from harnack.fields.batched_fields import SourceSum, cached_upload
 from harnack.fields.clearance import tight_extent
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.oriented_points import OrientedPoints
+from harnack.fields.solid_angles.oriented_points import (
+    OrientedPoints,
+    check_estimates,
+    plain_arrays,
+)
+from harnack.fmm.moving_dipoles import MovingDipoles
 from harnack.fmm.point_values import PointValues
 from harnack.fmm.radial_kernel import (
     BALL_FRACTION,
@@ -301,7 +306,9 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     or accuracy.
     """
 
-    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
+    traits = dataclasses.replace(
+        SourceSum.traits, is_larger_inside=True, has_parameter_derivatives=True
+    )
 
     def __init__(
         self,
@@ -323,12 +330,18 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         accuracy: for the tree; larger is more accurate.
         """
         super().__init__()
+        check_no_derivatives(type(self).__name__, length, method, accuracy)
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
             hint = did_you_mean(method, ("auto", "sum", "tree"))
             raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}{hint}')
         if not 2 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
+        name = type(self).__name__
+        self.is_estimated = [False, areas is None]  # normals, areas
+        given = {"points": points, "normals": normals}
+        check_estimates(name, given, has_normals=True, has_areas=areas is not None)
+        points, normals, areas = plain_arrays(points, normals, areas)
         if areas is None:
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))
@@ -421,6 +434,13 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         # Far away a tree sums fewer than 64 nodes; the direct sum always has all terms.
         terms = 64 if self.method == "tree" else len(self.points)
         return values.with_far_field_errors(x, max(terms, 64), weight).rescaled(data.size)
+
+    def moving_sum(self, backend: Backend) -> MovingDipoles | None:
+        """w as a sum over all dipoles, with derivatives by the points, normals and areas
+        (`BatchedField.moving_sum`)."""
+        frame = UnitFrame(*frame_parameters(backend, self._center, self._size))
+        kernel = YukawaKernel(backend, self._kappa)
+        return self._moving_dipoles(frame, kernel, 1 / (4 * math.pi))
 
     def _ray_data(self, backend: Backend, plan: Plan) -> _ScreenedBuffers:
         del plan

@@ -23,7 +23,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, tensor_to_vectors
-from harnack.backend.validation import check_length_range
+from harnack.backend.validation import check_length_range, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
@@ -40,7 +40,6 @@ from harnack.fmm.curve_cells import CurveCells, CurveCellSums
 from harnack.fmm.curve_queries import (
     closest_on_segments,
     continuous_change,
-    differentiable_angle,
     gradient_change_bound,
     lift_ball,
     remainder_promises,
@@ -53,6 +52,7 @@ from harnack.fmm.edges import (
     sum_over_edges,
     vertex_rounding,
 )
+from harnack.fmm.moving_edges import MovingEdges
 from harnack.fmm.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.fmm.trail_sums import RayLine, line_rates, lipschitz_along
 from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters
@@ -161,6 +161,7 @@ class SolidAngle(FieldWithCells):
             megabytes that they may take.
         """
         super().__init__()
+        check_no_derivatives(type(self).__name__, lift_bound, cells)
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
         curves, self._differentiable_loops = _movable_loops(loops)
@@ -714,9 +715,10 @@ class CurveEvaluator(Evaluator):
     def differentiable_value(self, p: Vec3) -> Real:
         """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
         the vertices of loops."""
-        backend = backend_of(p)
-        angle = differentiable_angle(backend, self.loops, p)
         data = self.data
+        angle = dr.zeros(data.backend.Float, dr.width(p))
+        if self.loops:
+            angle = MovingEdges.of_loops(data, self.loops).angle(p)
         if data.circles is None:
             return angle
         # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
@@ -725,6 +727,24 @@ class CurveEvaluator(Evaluator):
             q = dr.detach(p)
             sums = data.circles.sums(data.to_unit(q))
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        """The gradient of f at points p, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of loops."""
+        data = self.data
+        if not any(map(dr.grad_enabled, self.loops)):
+            return super().differentiable_gradient(p)
+        gradient = MovingEdges.of_loops(data, self.loops).gradient(p)
+        if data.circles is None:
+            return gradient
+        # The part of the circles, to first order in p, by their second derivatives.
+        with dr.suspend_grad():
+            q = dr.detach(p)
+            x, vector = data.to_unit(q), data.backend.Array3f
+            own = data.circles.sums(x).gradient / data.size
+            rows = data.circles.hessian(x).rows(vector)
+        moved = (p - q) / (data.size * data.size)
+        return gradient + own + vector(*(dr.dot(row, moved) for row in rows))
 
     def describe(self) -> dict[str, Any]:
         """The facts of `SolidAngle.describe`, with the number and the memory of the FMM cells that
