@@ -461,7 +461,7 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
             *frame_parameters(backend, self._center, self._size),
             kernel,
             dipoles,
-            float(self._rows[:, 6].sum()),
+            dr.opaque(backend.Float, float(self._rows[:, 6].sum())),
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -520,7 +520,7 @@ class _ScreenedBuffers(UnitFrame):
 
     kernel: YukawaKernel
     dipoles: RadialSum
-    weight: float
+    weight: Real
 
     @property
     def coarsest_accuracy(self) -> float:
