@@ -21,7 +21,6 @@ from harnack.backend import FloatArray, backend_of
 from harnack.backend.arrays import as_kernel_parameters
 from harnack.backend.elementary import fmax
 from harnack.backend.tensors import accepts_tensors
-from harnack.backend.validation import check_no_derivatives
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.enclosures.samples import value_error_bound
 from harnack.fields.batch_evaluation import evaluate_points
@@ -99,8 +98,8 @@ class BatchedField(Field):
         return self._choose_at_points(points, precision, 1, lambda at: (at.gradient,))[0]
 
     def moving_sum(self, backend: Backend) -> MovingSum | None:
-        """f on a backend as an expression that Dr.Jit differentiates by points and by the parameters
-        of the field; None if no parameter has derivatives enabled. The default knows none.
+        """f on a backend, as an expression that Dr.Jit differentiates by points and by the
+        parameters of the field; None, as by default, if no parameter has derivatives enabled.
 
         Raises:
             NotImplementedError: derivatives by some of them are not known.
@@ -226,9 +225,9 @@ class BatchedEvaluator(Evaluator):
         return sample.gradient_error, self.values_at(p, 2).hessian_error
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward mode,
-        with respect to p and to parameters of the field. By p alone, its derivative is the gradient
-        of `BatchedField.sharp_values_at`."""
+        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward
+        mode, with respect to p and to parameters of the field. By p alone, its derivative is the
+        gradient of `BatchedField.sharp_values_at`."""
         moving = self.field.moving_sum(backend_of(p))
         return _differentiable_value(self.field, p) if moving is None else moving.value(p)
 
@@ -250,12 +249,9 @@ class _EvaluatorOfUsersClass(BatchedEvaluator, SampleEvaluator):
             NotImplementedError: parameters have derivatives enabled, and `evaluate` has none by
                 them, for example because it calls that of the base class.
         """
-        parameters = differentiable_parameters(self.field)
-        if not any(map(dr.grad_enabled, parameters)):
-            return _differentiable_value(self.field, p)
-        if not dr.grad_enabled(self.evaluate(dr.detach(p)).value):
-            check_no_derivatives(f"the evaluate of {self.name}", parameters)
-        return self.evaluate(p).value
+        if any(map(dr.grad_enabled, differentiable_parameters(self.field))):
+            return SampleEvaluator.differentiable_value(self, p)
+        return _differentiable_value(self.field, p)
 
     def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
         if any(map(dr.grad_enabled, differentiable_parameters(self.field))):

@@ -21,7 +21,7 @@ from harnack.fmm.edges import inner_product, spinor
 from harnack.fmm.pair_sums import pair_sum
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Real, Vec3
     from harnack.fmm.unit_frame import UnitFrame
 
 
@@ -48,7 +48,11 @@ class MovingEdges:
             start = np.arange(count)
             end = np.append(start[1:], 0)
             parts.append(_coordinates(frame, loop, start, end))
-        ends = parts[0] if len(parts) == 1 else [dr.concat(entry) for entry in zip(*parts, strict=True)]
+        ends = (
+            parts[0]
+            if len(parts) == 1
+            else [dr.concat(entry) for entry in zip(*parts, strict=True)]
+        )
         return cls(frame, tuple(ends))
 
     @classmethod

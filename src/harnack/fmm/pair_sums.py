@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, Real, Vec3
+    from harnack.backend import Backend, Mask, Real, Vec3
 
 Term: TypeAlias = "Callable[[Vec3, tuple[Real, ...]], tuple[Real, ...]]"
 """A function that takes a point (3,) and the numbers of a record, and returns the numbers that are
@@ -168,15 +168,16 @@ class _PairSum(dr.CustomOp):
 
         zeros = (dr.zeros(backend.Float, self._record_count * share),) * len(record)
         start = (lane - record_index * step, *zeros)
-        sums = dr.while_loop(
-            start, lambda i, *_: i < self._all_points, add, label="pair sum by records"
-        )[1:]
+
+        def is_left(i: Any, *_: Any) -> Mask:
+            """Whether there is a point i."""
+            return i < self._all_points
+
+        sums = dr.while_loop(start, is_left, add, label="pair sum by records")[1:]
         dr.eval(sums)
         return tuple(dr.block_sum(entry, share) for entry in sums)
 
-    def _backward_by_ranges(
-        self, weights: tuple[_Column, ...]
-    ) -> tuple[Vec3, tuple[Real, ...]]:
+    def _backward_by_ranges(self, weights: tuple[_Column, ...]) -> tuple[Vec3, tuple[Real, ...]]:
         """The derivatives by the points and by the records, where each point has records of its
         own. weights: those by the sums."""
         backend = self._backend
@@ -215,7 +216,9 @@ class _PairSum(dr.CustomOp):
             moved = _attached(x) if wanted[0] else x
             numbers = tuple(map(_attached, record)) if wanted[1] else record
             terms = self._term(moved, numbers)
-            total = sum((w * t for w, t in zip(weights, terms, strict=True)), self._backend.Float(0))
+            total = sum(
+                (w * t for w, t in zip(weights, terms, strict=True)), self._backend.Float(0)
+            )
             dr.backward_from(total, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             by_point = dr.grad(moved) if wanted[0] else 0 * x
             by_record = [dr.grad(entry) if wanted[1] else 0 * entry for entry in numbers]
@@ -247,7 +250,12 @@ class _PairSum(dr.CustomOp):
             return j + 1, *add(j, x, record, state)
 
         start = (self._first + dr.zeros(backend.UInt32, self._point_count), *state)
-        return dr.while_loop(start, lambda j, *_: j < self._last, read_and_add, label=label)[1:]
+
+        def is_left(j: Any, *_: Any) -> Mask:
+            """Whether record j is still to be added."""
+            return j < self._last
+
+        return dr.while_loop(start, is_left, read_and_add, label=label)[1:]
 
 
 class _Column:

@@ -334,6 +334,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
         cells: bool | float | None = None,
     ) -> None:
         super().__init__()
+        name = type(self).__name__
+        check_no_derivatives(name, smoothing, accuracy, cells)
         if normals is None:
             raise CloudError(
                 "normals are missing, and without them inside and outside are not known: give "
@@ -341,8 +343,6 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
             )
         if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
-        name = type(self).__name__
-        check_no_derivatives(name, smoothing, accuracy, cells)
         self.is_estimated = [isinstance(normals, str), areas is None]  # normals, areas
         check_estimates(
             name,

@@ -15,7 +15,6 @@ from harnack.backend.tensors import is_tensor, tensor_to_array, tensor_to_vector
 from harnack.backend.validation import check_no_derivatives
 from harnack.fields.parameters import kept_arguments
 from harnack.fmm.moving_dipoles import MovingDipoles
-from harnack.geometry import CloudError
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, FloatArray, Real, Vec3
@@ -71,9 +70,7 @@ class OrientedPoints:
         if not any(map(dr.grad_enabled, given.values())):
             return None
         has_normals, has_areas = (not is_estimated for is_estimated in self.is_estimated)
-        check_estimates(
-            type(self).__name__, given, has_normals=has_normals, has_areas=has_areas
-        )
+        check_estimates(type(self).__name__, given, has_normals=has_normals, has_areas=has_areas)
         backend = frame.backend
         return MovingDipoles.of(
             frame,

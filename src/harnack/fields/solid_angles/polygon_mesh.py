@@ -16,7 +16,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
@@ -131,9 +131,7 @@ class FaceLoops:
         )  # fmt: skip
         return cls(RecordTable.upload(backend, heads), edges)
 
-    def face(
-        self, index: Any, moving: Callable[[], FaceEdges] | None = None
-    ) -> FaceSolidAngle:
+    def face(self, index: Any, moving: Callable[[], FaceEdges] | None = None) -> FaceSolidAngle:
         """The solid angle of the face with this index. The index may differ from lane to lane.
         moving: as of `FaceSolidAngle`."""
         row = self.heads.read_record(index)  # self.heads: one record for each face
@@ -193,7 +191,7 @@ class FaceEdges:
 
     def of_faces(self, index: Any) -> tuple[Any, Any]:
         """The first edge and the number of edges of faces with these indices."""
-        kind = type(self.first)
+        kind = cast("Any", type(self.first))
         return dr.gather(kind, self.first, index), dr.gather(kind, self.count, index)
 
 
@@ -218,8 +216,8 @@ class FaceSolidAngle(Evaluator):
     index: Any = None
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by the
-        vertices of faces."""
+        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of faces."""
         if self.moving is None:
             return super().differentiable_value(p)
         edges = self.moving()

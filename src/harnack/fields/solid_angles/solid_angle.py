@@ -366,11 +366,14 @@ class SolidAngle(FieldWithCells):
         points = np.concatenate([*self._net_loops, *corners]) - center
         return points.min(axis=0) / self._size, points.max(axis=0) / self._size
 
-    @functools.cached_property
+    @property
     def _without_cells(self) -> SolidAngle:
         """The same field without FMM cells; this field itself if it has none."""
-        if not self.cell_choice():
-            return self
+        return self._copy_without_cells if self.cell_choice() else self
+
+    @functools.cached_property
+    def _copy_without_cells(self) -> SolidAngle:
+        """The same field without FMM cells, as another field."""
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _evaluate_points(

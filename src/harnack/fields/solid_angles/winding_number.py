@@ -51,6 +51,7 @@ from harnack.fields.capabilities import (
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.field import Field, Sample, Traits, space_scaled
+from harnack.fields.parameters import kept_arguments, record_arguments
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import (
     NO_CELLS,
@@ -58,7 +59,6 @@ from harnack.fields.solid_angles.cell_options import (
     CellChoice,
     FieldWithCells,
 )
-from harnack.fields.parameters import kept_arguments, record_arguments
 from harnack.fields.solid_angles.moving_vertices import (
     MovingWinding,
     plain_vertices,
@@ -352,19 +352,22 @@ class WindingNumber(FieldWithCells, BatchedField):
         field = copy.copy(self)
         field._mesh = self.mesh.with_vertices(plain_vertices(vertices))
         record_arguments(field, vertices=vertices)  # they may have derivatives
-        vars(field).pop("detached", None)
+        vars(field).pop("_detached_copy", None)
         # What was computed from the old positions is dropped.
         field._extents, field._occupied = TransientCache(), TransientCache()
         field._own_levels = TransientCache()
         field.configure_cells(self.cells)
         return field
 
-    @functools.cached_property
+    @property
     def detached(self) -> WindingNumber:
         """The same field without derivatives by its vertices; this field itself if it was given
         NumPy arrays."""
-        if self._given_vertices is None:
-            return self
+        return self if self._given_vertices is None else self._detached_copy
+
+    @functools.cached_property
+    def _detached_copy(self) -> WindingNumber:
+        """The same field without derivatives by its vertices, as another field."""
         field = copy.copy(self)
         record_arguments(field, vertices=self.mesh.vertices)
         return field
