@@ -250,10 +250,10 @@ PARTS: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     },
 }
 # Records of settings, results and pictures, and proofs.
-NO_PARTS = {"Boundary", "NearestFacet", "PatchEntry", "VariableAccuracy", "JumpCrossing",
-            "LevelGaps", "MarchResult", "Plan", "SurfaceTracer", "TraceOptions", "Traits",
+NO_PARTS = {"Boundary", "MovingTriangles", "NearestFacet", "PatchEntry", "VariableAccuracy",
+            "JumpCrossing", "LevelGaps", "MarchResult", "Plan", "SurfaceTracer", "TraceOptions",
             "TracedSurface", "RayCrossings", "Camera", "CurvatureSamples", "DistanceBounds", "Hits",
-            "ClearanceHits",
+            "ClearanceHits", "Traits",
             "Isolines", "Surface", "PrintCheck", "PrintProblem", "Sample", "SceneFile", "Slider",
             "WallThickness", "HitTolerance", "LiveView"}  # fmt: skip
 

@@ -320,7 +320,8 @@ def test_one_term_may_jump(method: Any) -> None:
     difference = (at[1 + 1e-5] - at[1 - 1e-5])[is_off] / 2e-5
     derivative = np.array(dr.grad(hits.t))
     np.testing.assert_allclose(derivative[is_off], difference, rtol=1e-5, atol=1e-7)
-    assert is_off.any() and not derivative[np.array(hits.primitive_index) >= 0].any()
+    assert is_off.any()
+    assert not derivative[np.array(hits.primitive_index) >= 0].any()
 
 
 def _weight(number: float = 1.0) -> Float64:

@@ -355,9 +355,9 @@ class Field(FieldOperators, Parametrized, abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) gives a tensor (n, 3). Both
         have derivatives with respect to the points if these have derivatives enabled and the field
-        defines `hessian`; and with respect to parameters of formulas and of solids that have
-        formulas (`Traits.differentiable_arguments`). Raises the errors of `value`, and
-        NotImplementedError if other parameters of the field have derivatives enabled.
+        defines `hessian`; and with respect to the field's parameters that have derivatives enabled,
+        if `Evaluator.differentiable_gradient` or the field's formula knows these. Raises the errors
+        of `value`, and NotImplementedError if it does not.
 
         precision: as for `value`.
         """

@@ -288,6 +288,11 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
     those of the denoised points. `describe` has the estimated noise, the number of input points,
     and the number of points that were left out.
 
+    Derivatives. Points, normals and areas may be Dr.Jit arrays (3-vectors of n lanes, arrays of n
+    entries) or tensors of the same shapes as in NumPy. Hits, values and gradients can then be
+    differentiated by them (`fmm.moving_dipoles`). The default level is held fixed. Normals and
+    areas that would be estimated from arrays with derivatives enabled are refused.
+
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
         spanning tree (`geometry.estimate_normals`).
@@ -314,7 +319,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
     `with_points` gives the field of points that have moved.
 
     Raises CloudError (a ValueError) if the arguments are no oriented point cloud; ValueError for an
-    invalid smoothing or accuracy.
+    invalid smoothing or accuracy; NotImplementedError for derivatives that would be lost.
     """
 
     period: ClassVar[float | None] = None

@@ -529,7 +529,8 @@ class PolygonMesh(PatchField):
     *patch* for each face, the solid angle of that face. Which face is meant may differ from lane to
     lane.
 
-    vertices: (n, 3).
+    vertices: (n, 3); a Dr.Jit 3-vector of n lanes or a tensor, if hits are to be differentiated by
+        them.
     faces: a list of faces. A face is a list of at least three indices of vertices, in
         counter-clockwise order seen from outside; or it is a list of such loops, in which holes run
         clockwise. Faces may have different numbers of corners, and need not be joined.

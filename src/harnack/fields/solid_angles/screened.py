@@ -276,6 +276,10 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     should be longer than the distance between neighboring points: else the level sets are those of
     single dipoles.
 
+    Derivatives. Points, normals and areas may be Dr.Jit arrays (3-vectors of n lanes, arrays of n
+    entries) or tensors. Hits, values and gradients can then be differentiated by them
+    (`fmm.moving_dipoles`). The default level is held fixed.
+
     points, normals: (n, 3), normals of any length, to the outside.
     areas: (n,) the areas that the points stand for; None estimates them.
     length: l, in the points' unit.
@@ -303,7 +307,7 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
 
     Raises CloudError (a ValueError) as `validate_cloud`; ValueError for an invalid length, method
-    or accuracy.
+    or accuracy; NotImplementedError for derivatives that would be lost.
     """
 
     traits = dataclasses.replace(

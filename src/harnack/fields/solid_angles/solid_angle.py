@@ -94,8 +94,9 @@ class SolidAngle(FieldWithCells):
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
         closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
-        Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
-        vertices. Circles are exact, and cost about as much time as nine vertices.
+        Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits, values and gradients can be
+        differentiated by its vertices (`fmm.moving_edges`), but not by circles. Circles are exact,
+        and cost about as much time as nine vertices.
 
     Edges that are traversed in both directions, by one loop or by two neighbors, are removed before
     anything is computed (`cancel_opposite_edges`): they do not contribute to f. If no edge is left,

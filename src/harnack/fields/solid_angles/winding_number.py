@@ -255,7 +255,9 @@ class WindingNumber(FieldWithCells, BatchedField):
     jumps by integers across them. The surface w = 1/2 is the mesh itself where the mesh is sound,
     and spans its holes. Faces are counter-clockwise seen from outside.
 
-    vertices: (n, 3).
+    vertices: (n, 3). They may be a Dr.Jit 3-vector of n lanes, or a tensor: hits, values and
+        gradients can then be differentiated by them (`moving_vertices.MovingWinding`). Hits on
+        triangles move with their planes.
     faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, time by the number of singular edges), "tree"
         (`winding_tree`), or "auto": exact up to 2048 singular edges.
