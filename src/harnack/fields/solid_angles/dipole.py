@@ -290,8 +290,9 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
 
     Derivatives. Points, normals and areas may be Dr.Jit arrays (3-vectors of n lanes, arrays of n
     entries) or tensors of the same shapes as in NumPy. Hits, values and gradients can then be
-    differentiated by them (`fmm.moving_dipoles`). The default level is held fixed. Normals and
-    areas that would be estimated from arrays with derivatives enabled are refused.
+    differentiated by them (`fmm.moving_dipoles`); values with derivatives are sums over all points,
+    without the truncation of a tree. The default level is held fixed. Normals and areas that would
+    be estimated from arrays with derivatives enabled are refused.
 
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
