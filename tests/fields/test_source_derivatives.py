@@ -192,6 +192,18 @@ def test_a_closed_mesh_has_a_winding_number_that_does_not_move() -> None:
     np.testing.assert_allclose(dr.grad(vertices), 0.0, atol=1e-15)
 
 
+@pytest.mark.slow
+def test_a_coordinate_that_all_vertices_share_moves_facets() -> None:
+    triangle = Array3f64([0.0, 1.0, 0.0], [0.0, 0.0, 1.0], 0.5)
+    dr.enable_grad(triangle)
+    field = hk.WindingNumber(triangle, [[0, 1, 2]])
+    hits = hk.trace(
+        field, Array3f64([0.2, 5.0], 0.3, 2.0), Array3f64(0, 0, -1)
+    )  # the second misses
+    dr.backward(dr.sum(dr.select(hits.is_hit, hits.t + hits.normal.x, 0)))
+    np.testing.assert_allclose(np.array(triangle.z.grad).ravel(), [-1.0], atol=1e-12)
+
+
 def test_vertices_at_the_same_place_move_one_by_one() -> None:
     """The edges of a soup of triangles do not cancel where only one of their vertices moves."""
     soup = VERTICES[FACES].reshape(-1, 3)

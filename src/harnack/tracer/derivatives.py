@@ -15,7 +15,7 @@ weights as the hit, q = sum w_i v_i, at which n . dq is how far the plane moves:
 
     dt = n . (dq - do - t dd)/(n . d).
 
-For a change dn of the normal contributes dn . (o + t d - q) = 0.
+A change dn of the normal contributes dn . (o + t d - q) = 0.
 
 So no derivative passes through `evaluate`, which may run a recorded loop. If a derivative would be
 lost, an error is raised: for arguments by `validation` and `Field.__new__`, for results by
@@ -235,7 +235,8 @@ def _with_facet_derivative(normal: Vec3, corners: tuple[Vec3, Vec3, Vec3]) -> Ve
     a, b, c = corners
     area = dr.cross(b - a, c - a)
     length = norm(area)
-    unit = dr.select(length > 0, area / length, 0)
+    # Rays without a hit have no area; a quotient by 0 would make derivatives NaN.
+    unit = area / dr.select(length > 0, length, 1)
     is_reversed = dr.dot(dr.detach(unit), dr.detach(normal)) < 0
     return dr.replace_grad(dr.detach(normal), dr.select(is_reversed, -unit, unit))
 
