@@ -308,12 +308,24 @@ def test_one_term_may_jump(method: Any) -> None:
     (alone, doubled) = (hk.trace(field, o, d) for field in (winding, 2 * winding))
     np.testing.assert_array_equal(doubled.is_hit, alone.is_hit)
     assert doubled.evaluations.mean() <= 1.02 * alone.evaluations.mean()
-    with pytest.raises(NotImplementedError, match="hits of a field with jumps"):
-        hk.trace(winding + Y20 * _weight(), Array3f64(o.T.copy()), Array3f64(d.T.copy()))
+    # By weights, facets stay where they are, and hits on the surface between them move.
+    at, weight = {}, 1.0
+    for number in (1 - 1e-5, 1 + 1e-5, 1.0):
+        weight = _weight(number)
+        hits = hk.trace(winding + Y20 * weight, Array3f64(o.T.copy()), Array3f64(d.T.copy()))
+        at[number] = np.array(dr.select(hits.is_hit & (hits.primitive_index < 0), hits.t, 0))
+    dr.set_grad(weight, 1.0)
+    dr.forward_to(hits.t)
+    is_off = at[1.0] > 0
+    difference = (at[1 + 1e-5] - at[1 - 1e-5])[is_off] / 2e-5
+    derivative = np.array(dr.grad(hits.t))
+    np.testing.assert_allclose(derivative[is_off], difference, rtol=1e-5, atol=1e-7)
+    assert is_off.any()
+    assert not derivative[np.array(hits.primitive_index) >= 0].any()
 
 
-def _weight() -> Float64:
-    weight = Float64(1.0)
+def _weight(number: float = 1.0) -> Float64:
+    weight = Float64(number)
     dr.enable_grad(weight)
     return weight
 

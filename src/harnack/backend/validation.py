@@ -180,9 +180,9 @@ def check_no_derivatives(name: str, *values: Any) -> None:
         raise NotImplementedError(
             f"{name} cannot be differentiated by these numbers, which carry derivatives: detach "
             "them, as drjit.detach and torch.Tensor.detach do (known are derivatives by rays, "
-            "levels, points, the vertices of a SolidAngle, the weights of a FieldSum, numbers of "
-            "formulas, many solids, blobs, series and networks, and by the parameters of a field "
-            "of your own whose traits are "
+            "levels, points, vertices of curves and meshes, oriented points, the weights of a "
+            "FieldSum, numbers of formulas, many solids, blobs, series and networks, and by the "
+            "parameters of a field of your own whose traits are "
             "harnack.fields.Traits(has_parameter_derivatives=True); tensors of PyTorch pass "
             "through a function that harnack.io.wrap_for_torch has wrapped)"
         )

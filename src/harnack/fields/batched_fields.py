@@ -83,8 +83,8 @@ class BatchedField(Field):
     @accepts_tensors
     def value(self, points: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(points)):
-            if dr.grad_enabled(points):
-                return _differentiable_value(self, points)
+            if has_moving_numbers(self, points):
+                return super().value(points)
             return self.values_at(points, 0).value
         return self._choose_at_points(points, precision, 0, lambda at: (at.value,))[0]
 
@@ -92,10 +92,20 @@ class BatchedField(Field):
     @accepts_tensors
     def gradient(self, points: Any, *, precision: Precision | None = None) -> Any:
         if dr.is_array_v(type(points)):
-            if dr.grad_enabled(points):
+            if has_moving_numbers(self, points):
                 return super().gradient(points)
             return self.sharp_values_at(points).gradient
         return self._choose_at_points(points, precision, 1, lambda at: (at.gradient,))[0]
+
+    def moving_sum(self, backend: Backend) -> MovingSum | None:
+        """f on a backend, as an expression that Dr.Jit differentiates by points and by the
+        parameters of the field; None, as by default, if no parameter has derivatives enabled.
+
+        Raises:
+            NotImplementedError: derivatives by some of them are not known.
+        """
+        del backend
+        return None
 
     def value_and_gradient(
         self, points: Any, *, precision: Precision | None = None
@@ -215,15 +225,38 @@ class BatchedEvaluator(Evaluator):
         return sample.gradient_error, self.values_at(p, 2).hessian_error
 
     def differentiable_value(self, p: Vec3) -> Real:
-        """f at p as an expression that Dr.Jit can differentiate once with respect to p, in reverse
-        and in forward mode. Its derivative is the gradient of `BatchedField.sharp_values_at`."""
-        return _differentiable_value(self.field, p)
+        """f at p as an expression that Dr.Jit can differentiate once, in reverse and in forward
+        mode, with respect to p and to parameters of the field. By p alone, its derivative is the
+        gradient of `BatchedField.sharp_values_at`."""
+        moving = self.field.moving_sum(backend_of(p))
+        return _differentiable_value(self.field, p) if moving is None else moving.value(p)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        moving = self.field.moving_sum(backend_of(p))
+        return super().differentiable_gradient(p) if moving is None else moving.gradient(p)
 
 
 class _EvaluatorOfUsersClass(BatchedEvaluator, SampleEvaluator):
     """The evaluator of a `BatchedField` whose class defines `evaluate`."""
 
     field: Any
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f at p, with derivatives by those parameters on which the user's `evaluate` depends. The
+        `moving_sum` of a base class is of another function.
+
+        Raises:
+            NotImplementedError: parameters have derivatives enabled, and `evaluate` has none by
+                them, for example because it calls that of the base class.
+        """
+        if any(map(dr.grad_enabled, differentiable_parameters(self.field))):
+            return SampleEvaluator.differentiable_value(self, p)
+        return _differentiable_value(self.field, p)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        if any(map(dr.grad_enabled, differentiable_parameters(self.field))):
+            return None
+        return Evaluator.differentiable_gradient(self, p)
 
 
 def _evaluator_of_users_class(
@@ -255,6 +288,19 @@ def _values_of_samples(
     return PointValues(
         sample.value, error, sample.gradient, hessian, sample.gradient_error, math.inf
     )
+
+
+class MovingSum(Protocol):
+    """A function f that Dr.Jit differentiates by points and by what f is made of, in forward and
+    reverse mode."""
+
+    def value(self, p: Vec3) -> Real:
+        """f at points p (3, n) of space."""
+        ...
+
+    def gradient(self, p: Vec3) -> Vec3:
+        """The gradient of f at points p (3, n) of space."""
+        ...
 
 
 class SumData(Protocol):
@@ -326,6 +372,14 @@ class _SumAtAccuracy(Evaluator):
     def evaluate(self, p: Vec3) -> Sample:
         return self.data.sample(p, self.detail)
 
+    def differentiable_value(self, p: Vec3) -> Real:
+        moving = self.field.moving_sum(self.data.backend)
+        return super().differentiable_value(p) if moving is None else moving.value(p)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        moving = self.field.moving_sum(self.data.backend)
+        return super().differentiable_gradient(p) if moving is None else moving.gradient(p)
+
     def hessian(self, p: Vec3) -> tuple[Vec3, Vec3, Vec3]:
         return _required_hessian(self._values(p)).rows(backend_of(p).Array3f)
 
@@ -337,6 +391,11 @@ class _SumAtAccuracy(Evaluator):
         real = self.data.backend.Float
         # The accuracy scale of `values_at` must be at least 1.
         return self.field.values_at(p, 2, fmax(real(self.detail), real(1)))
+
+
+def has_moving_numbers(field: Field, points: Any) -> bool:
+    """Whether Dr.Jit points, or parameters of a field, have derivatives enabled."""
+    return any(map(dr.grad_enabled, (points, *differentiable_parameters(field))))
 
 
 def _differentiable_value(field: BatchedField, p: Vec3) -> Real:
@@ -426,7 +485,8 @@ def cached_upload(upload: Upload) -> Upload:
     be deleted.
 
     A field with parameters is uploaded at each call: a parameter may change in place, and its
-    derivatives belong to a single trace.
+    derivatives belong to a single trace. But not if its class says `copies_parameters`: the data
+    are of copies without derivatives, which the constructor made.
 
     The decorated method raises a RuntimeError if it would have to upload while a loop is recorded,
     when Dr.Jit might end the process.
@@ -437,7 +497,7 @@ def cached_upload(upload: Upload) -> Upload:
     @functools.wraps(upload)
     def cached(self: Field, backend: Backend, *arguments: Any, **settings: Any) -> Any:
         """The data: the cached ones, unless the field has parameters."""
-        if differentiable_parameters(self):
+        if not getattr(self, "copies_parameters", False) and differentiable_parameters(self):
             _refuse_while_recording(self)
             return upload(self, backend, *arguments, **settings)
         uploads = cache.get(self, None, dict)

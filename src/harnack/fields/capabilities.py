@@ -86,6 +86,18 @@ class NearestFacet:
     is_inner: Mask
 
 
+@dataclass(frozen=True)
+class MovingTriangles:
+    """Triangular facets of a function f with jumps, with derivatives by their vertices.
+
+    vertices: a Dr.Jit 3-vector with a lane for each vertex.
+    corners: for each facet the index of its first, second and third corner, three Dr.Jit UInt32.
+    """
+
+    vertices: Vec3
+    corners: tuple[Any, Any, Any]
+
+
 NO_PATCH = 0xFFFFFFFF
 """The index that stands for no patch; larger than the index of any patch."""
 
@@ -215,6 +227,12 @@ class Jumps(abc.ABC):
         only, by descent of `distance`.
         """
         del p, after, limit, active
+        return None
+
+    def moving_triangles(self) -> MovingTriangles | None:
+        """The facets as triangles between vertices that may have derivatives enabled, by which hits
+        on facets are differentiated; None, the default, if they are not known. Then hits of a field
+        with parameters that have derivatives enabled are refused."""
         return None
 
     def mesh(self) -> tuple[FloatArray, IntArray, bool] | None:

@@ -355,9 +355,9 @@ class Field(FieldOperators, Parametrized, abc.ABC):
 
         A Dr.Jit 3-vector gives a Dr.Jit 3-vector, and a tensor (n, 3) gives a tensor (n, 3). Both
         have derivatives with respect to the points if these have derivatives enabled and the field
-        defines `hessian`; and with respect to parameters of formulas and of solids that have
-        formulas (`Traits.differentiable_arguments`). Raises the errors of `value`, and
-        NotImplementedError if other parameters of the field have derivatives enabled.
+        defines `hessian`; and with respect to the field's parameters that have derivatives enabled,
+        if `Evaluator.differentiable_gradient` or the field's formula knows these. Raises the errors
+        of `value`, and NotImplementedError if it does not.
 
         precision: as for `value`.
         """
@@ -624,10 +624,25 @@ class SampleEvaluator(Evaluator):
         return self.field.hessian(p)
 
     def differentiable_value(self, p: Vec3) -> Real:
-        if any(map(dr.grad_enabled, differentiable_parameters(self.field))):
+        parameters = differentiable_parameters(self.field)
+        if any(map(dr.grad_enabled, parameters)):
+            # The `evaluate` of a base class has no derivatives by its parameters.
+            if _has_parameters_of_base(type(self.field)):
+                value = self.evaluate(dr.detach(p)).value
+                if not dr.grad_enabled(value):
+                    check_no_derivatives(f"the evaluate of {self.name}", parameters)
             return self.evaluate(p).value
         refuse_hidden_parameters(self.field)
         return super().differentiable_value(p)
+
+
+def _has_parameters_of_base(kind: type[Field]) -> bool:
+    """Whether a user's class is derived from a class of this library that has derivatives by
+    parameters."""
+    bases = (base for base in kind.__mro__ if base.__module__.startswith("harnack."))
+    return any(
+        getattr(vars(base).get("traits"), "has_parameter_derivatives", False) for base in bases
+    )
 
 
 def refuse_hidden_parameters(field: Field) -> None:

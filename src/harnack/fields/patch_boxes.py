@@ -117,6 +117,10 @@ class PatchField(Field):
         """The evaluator of the patches, with boxes that contain them for the levels of the plan; or
         for the default level, if it has none."""
         patches = self._upload(backend, plan.levels or (self.default_level,))
+        return self.evaluator_of(patches)
+
+    def evaluator_of(self, patches: PatchesInBoxes) -> Evaluator:
+        """The evaluator of these patches."""
         return _PatchFieldEvaluator(patches, self.no_single_function)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from harnack.fields.capabilities import JumpCrossing, Jumps, NearestFacet
+from harnack.fields.capabilities import JumpCrossing, Jumps, MovingTriangles, NearestFacet
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
@@ -67,6 +67,9 @@ class WeightedJumps(Jumps):
         rounding = 16 * float(dr.epsilon(type(self.weight))) * (1 + dr.abs(own))
         own = dr.select(dr.abs(own - whole) <= rounding, whole, own)
         return self.with_continuation(self.inner.continuation(o, d, *ends, own))
+
+    def moving_triangles(self) -> MovingTriangles | None:
+        return self.inner.moving_triangles()
 
     def distance(self, p: Vec3) -> Real:
         return self.inner.distance(p)

@@ -2,7 +2,6 @@
 derivatives, closest points, changes, and proved bounds of f near x. f is known modulo 4 pi. In
 integrals along the curve, p is a point of the curve, |dp| the length element, and D = p - x.
 
-- `differentiable_angle`: the solid angle as an expression that Dr.Jit differentiates.
 - `closest_on_segments`: the closest point of the curve, at which the level sets end.
 - `continuous_change`: the change of the solid angle along a straight segment.
 - `remainder_promises`, `gradient_change_bound`, `lift_ball`: proved bounds of f near x. The ray
@@ -20,12 +19,11 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, to_vector3
-from harnack.backend.arrays import gather_vectors
+from harnack.backend import FloatArray
 from harnack.backend.elementary import clamp
 from harnack.backend.record_table import RecordTable
 from harnack.enclosures import HarmonicBall, TaylorRemainder
-from harnack.fmm.edges import inner_product, single_edges, spinor
+from harnack.fmm.edges import single_edges
 from harnack.fmm.source_sums import SUM_MARGIN
 
 if TYPE_CHECKING:
@@ -40,48 +38,6 @@ __all__ = [
     "remainder_promises",
     "segment_records",
 ]
-
-
-def differentiable_angle(backend: Backend, loops: tuple[Any, ...], x: Vec3) -> Real:
-    """Compute the solid angle (n,) of closed loops at points x, in steradians and modulo 4 pi, as
-    an expression that Dr.Jit can differentiate in forward and reverse mode.
-
-    loops: the vertices of each loop, as an array (m, 3) or as a Dr.Jit vector.
-    x: (3, n).
-
-    `edges.sum_over_edges` computes the value faster, but in a recorded loop, which reverse mode
-    cannot differentiate. Here every pair of a point and an edge is a lane, and a block sum adds up
-    the edges of each point. So the memory is proportional to the number of points times the number
-    of vertices. The formula is the same, but with one angle for each edge instead of a product. An
-    angle may jump by 4 pi; its derivative does not.
-    """
-    total = dr.zeros(backend.Float, dr.width(x))
-    for loop in loops:
-        vertices = loop if dr.is_array_v(type(loop)) else to_vector3(backend, np.asarray(loop))
-        total = total + _loop_angle(backend, vertices, backend.Array3f(x))
-    return total
-
-
-def _loop_angle(backend: Backend, vertices: Vec3, x: Vec3) -> Real:
-    """Compute the solid angle (n,) of one closed loop at points x, in steradians and modulo 4 pi,
-    as an expression that Dr.Jit can differentiate.
-
-    vertices: (3, m) of the loop.
-    x: (3, n).
-    """
-    # Lane i stands for point i // m and the edge from vertex i % m to the next one.
-    point_count, edge_count = dr.width(x), dr.width(vertices)
-    lane = dr.arange(backend.UInt32, point_count * edge_count)
-    point, edge = lane // edge_count, lane % edge_count
-    next_vertex = dr.select(edge + 1 == edge_count, 0, edge + 1)
-    lane_x = gather_vectors(backend, x, point)
-    a = gather_vectors(backend, vertices, edge) - lane_x
-    b = gather_vectors(backend, vertices, next_vertex) - lane_x
-    # The edge adds twice the argument of an inner product of spinors. The phase of a vertex's
-    # spinor is arbitrary; it enters the two edges at the vertex with opposite signs.
-    # The result of `spinor` ends with the spinor.
-    re, im = inner_product(spinor(a)[2], spinor(b)[2])
-    return dr.block_sum(2 * dr.atan2(im, re), edge_count)
 
 
 def segment_records(backend: Backend, start: FloatArray, end: FloatArray) -> RecordTable:

@@ -9,8 +9,13 @@ level and theta:
 
 Here df|_t is the change of f at a fixed t, by changes of o, d and theta. The trace runs without
 derivatives, and this derivative is attached to its t, by the gradient of a sample at the hit. A hit
-on a facet (a flat piece of surface at which f jumps) lies on a plane n . (o + t d) = const,
-whatever the level: dt = -(n . (do + t dd))/(n . d).
+on a facet (a flat piece of surface at which f jumps) lies on its plane n . (o + t d - q) = 0,
+whatever the level. Here q is the point of a triangle with corners v_i that has the same barycentric
+weights as the hit, q = sum w_i v_i, at which n . dq is how far the plane moves:
+
+    dt = n . (dq - do - t dd)/(n . d).
+
+A change dn of the normal contributes dn . (o + t d - q) = 0.
 
 So no derivative passes through `evaluate`, which may run a recorded loop. If a derivative would be
 lost, an error is raised: for arguments by `validation` and `Field.__new__`, for results by
@@ -57,9 +62,9 @@ def needs_derivatives(tracer: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
     o, d: (3,) origins and directions of the rays.
 
     Raises:
-        NotImplementedError: parameters of a field with jumps have derivatives enabled. They move
-            the facets at which the field jumps, and the derivative of that is not known here; zero
-            would be wrong.
+        NotImplementedError: parameters of a field with jumps have derivatives enabled. They may
+            move the facets at which the field jumps, and how is not known (`Jumps.
+            moving_triangles`); zero would be wrong.
     """
     field = tracer.field
     # Plain data has no derivatives; other attributes may hide some, and so may the function of a
@@ -69,7 +74,8 @@ def needs_derivatives(tracer: SurfaceTracer, o: Vec3, d: Vec3) -> bool:
         refuse_hidden_parameters(field)
     parameters = differentiable_parameters(tracer.field)
     field_has_derivatives = any(dr.grad_enabled(p) for p in parameters)
-    if field_has_derivatives and tracer.evaluator.jumps is not None:
+    jumps = tracer.evaluator.jumps
+    if field_has_derivatives and jumps is not None and jumps.moving_triangles() is None:
         name = type(tracer.field).__name__
         raise NotImplementedError(
             f"hits of a field with jumps cannot be differentiated by its parameters: detach "
@@ -137,8 +143,9 @@ def attach_derivatives(
     """
     # `hit_surface` takes the function of the patch that was hit, if the field is made of patches.
     t, is_hit, tracer = end.t, end.status == int(RayStatus.HIT), tracer.hit_surface(end)
+    corners = _facet_corners(tracer, end)
     if tracer.evaluator.jumps is not None:
-        t = _on_plane(tracer, o, d, end)
+        t = _on_plane(tracer, o, d, end, corners)
         is_hit &= ~end.at_jump
     backend = tracer.backend
     with dr.suspend_grad():
@@ -172,7 +179,10 @@ def attach_derivatives(
     change = change_of_value(tracer, point, x, sample.gradient)
     change = change - change_of_nearest_level(tracer, sample.value)
     t = dr.select(is_hit, with_implicit_derivative(t_hit, change, slope, is_hit), t)
-    return t, _with_normal_derivative(tracer, o, d, t, normal, is_hit)
+    normal = _with_normal_derivative(tracer, o, d, t, normal, is_hit)
+    if corners is not None:
+        normal = dr.select(end.at_jump, _with_facet_derivative(normal, corners), normal)
+    return t, normal
 
 
 def _with_normal_derivative(
@@ -182,7 +192,8 @@ def _with_normal_derivative(
     d that move; where this is not known, such that it is refused."""
     evaluator = tracer.evaluator
     gradient = None
-    if evaluator.jumps is None and evaluator.patches is None:
+    is_known = evaluator.jumps is None or evaluator.jumps.moving_triangles() is not None
+    if is_known:
         point = dr.fma(tracer.backend.Array3f(dr.select(is_hit, t, 0)), d, o)
         gradient = gradient_with_parameters(tracer.field, evaluator, point)
     if gradient is None:
@@ -192,11 +203,74 @@ def _with_normal_derivative(
     return dr.replace_grad(normal, unit)
 
 
-def _on_plane(tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real:
+def _facet_corners(tracer: SurfaceTracer, end: MarchResult) -> tuple[Vec3, Vec3, Vec3] | None:
+    """Return the three corners (3,) of the facets that were hit, with derivatives by the vertices;
+    None if facets are not known as triangles. end: how the rays ended. Rays that hit no facet have
+    corners at 0 without derivatives."""
+    backend, jumps = tracer.backend, tracer.evaluator.jumps
+    triangles = None if jumps is None else jumps.moving_triangles()
+    if triangles is None:
+        return None
+    indices = (
+        dr.gather(backend.UInt32, corner, end.facet, end.at_jump) for corner in triangles.corners
+    )
+    a, b, c = (
+        backend.Array3f(
+            *(
+                # A coordinate that all vertices share has a single entry.
+                x if dr.width(x) == 1 else dr.gather(backend.Float, x, index, end.at_jump)
+                for x in backend.Array3f(triangles.vertices)
+            )
+        )
+        for index in indices
+    )
+    return a, b, c
+
+
+def _with_facet_derivative(normal: Vec3, corners: tuple[Vec3, Vec3, Vec3]) -> Vec3:
+    """Return the unit normals of triangles with derivatives by their corners.
+
+    normal: (3,) the normals without derivatives, on either side.
+    """
+    a, b, c = corners
+    area = dr.cross(b - a, c - a)
+    length = norm(area)
+    # Rays without a hit have no area; a quotient by 0 would make derivatives NaN.
+    unit = area / dr.select(length > 0, length, 1)
+    is_reversed = dr.dot(dr.detach(unit), dr.detach(normal)) < 0
+    return dr.replace_grad(dr.detach(normal), dr.select(is_reversed, -unit, unit))
+
+
+def _change_on_triangle(x: Vec3, corners: tuple[Vec3, Vec3, Vec3], is_on: Mask) -> Vec3:
+    """Return a zero vector with a derivative: that of the point of a moving triangle that keeps its
+    barycentric weights.
+
+    x: (3,) points of the triangles, without derivatives. is_on: on which lanes there are triangles.
+    """
+    with dr.suspend_grad():
+        a, b, c = (dr.detach(corner) for corner in corners)
+        u, v, to_x = b - a, c - a, x - a
+        area = dr.cross(u, v)
+        inverse = dr.select(is_on, 1 / dr.squared_norm(area), 0)
+        second = dr.dot(dr.cross(to_x, v), area) * inverse
+        third = dr.dot(dr.cross(u, to_x), area) * inverse
+        weights = 1 - second - third, second, third
+    moved = sum((w * (q - dr.detach(q)) for w, q in zip(weights, corners, strict=True)), 0 * x)
+    return dr.select(is_on, moved, 0)
+
+
+def _on_plane(
+    tracer: SurfaceTracer,
+    o: Vec3,
+    d: Vec3,
+    end: MarchResult,
+    corners: tuple[Vec3, Vec3, Vec3] | None,
+) -> Real:
     """Return the ray parameters t at which rays o + t d ended. At hits on facets, t has the
     derivative of the parameter at which the ray meets the facet's plane.
 
     tracer: the surface. end: how the rays ended.
+    corners: those of the facets, possibly with derivatives; None if facets do not move.
     """
     with dr.suspend_grad():
         t_hit = dr.select(end.at_jump, end.t, 0)
@@ -204,7 +278,10 @@ def _on_plane(tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult) -> Real
         slope = dr.dot(end.gradient, dr.detach(d))
     x = dr.fma(tracer.backend.Array3f(t_hit), d, o)
     # A zero with a derivative: that of the distance of a point at fixed t from the plane.
-    change = dr.dot(end.gradient, x - dr.detach(x))
+    moved = x - dr.detach(x)
+    if corners is not None:
+        moved = moved - _change_on_triangle(dr.detach(x), corners, end.at_jump)
+    change = dr.dot(end.gradient, moved)
     return with_implicit_derivative(end.t, change, slope, end.at_jump)
 
 

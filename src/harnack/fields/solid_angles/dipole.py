@@ -26,7 +26,7 @@ import numpy as np
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
-from harnack.backend.validation import as_positive, as_real, no_derivatives
+from harnack.backend.validation import as_positive, as_real, check_no_derivatives
 from harnack.fields.batched_fields import SourceSum, SumEvaluator, cached_upload
 from harnack.fields.capabilities import Boundary
 from harnack.fields.evaluator import POINTS, Plan
@@ -34,9 +34,14 @@ from harnack.fields.field import Sample, space_scaled
 from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.cell_options import CellChoice, FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
-from harnack.fields.solid_angles.oriented_points import OrientedPoints
-from harnack.fields.solid_angles.smoothed import SmoothedSum
+from harnack.fields.solid_angles.oriented_points import (
+    OrientedPoints,
+    check_estimates,
+    plain_arrays,
+)
+from harnack.fields.solid_angles.smoothed import SmoothedKernel, SmoothedSum
 from harnack.fmm.dipole_cells import DipoleCells, TreeWithCells, build_cells
+from harnack.fmm.moving_dipoles import MovingDipoles
 from harnack.fmm.multipole import dipole_tree_moments
 from harnack.fmm.point_values import PointValues, SymmetricMatrix, sharpened
 from harnack.fmm.source_sums import SourceSums, SourceTerm, dipole_rounding, final_rounding
@@ -283,6 +288,12 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
     those of the denoised points. `describe` has the estimated noise, the number of input points,
     and the number of points that were left out.
 
+    Derivatives. Points, normals and areas may be Dr.Jit arrays (3-vectors of n lanes, arrays of n
+    entries) or tensors of the same shapes as in NumPy. Hits, values and gradients can then be
+    differentiated by them (`fmm.moving_dipoles`); values with derivatives are sums over all points,
+    without the truncation of a tree. The default level is held fixed. Normals and areas that would
+    be estimated from arrays with derivatives enabled are refused.
+
     points: (n, 3).
     normals: (n, 3), outward, of any length; or "estimate", from neighbors, oriented along a
         spanning tree (`geometry.estimate_normals`).
@@ -309,12 +320,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
     `with_points` gives the field of points that have moved.
 
     Raises CloudError (a ValueError) if the arguments are no oriented point cloud; ValueError for an
-    invalid smoothing or accuracy.
+    invalid smoothing or accuracy; NotImplementedError for derivatives that would be lost.
     """
 
     period: ClassVar[float | None] = None
     default_level: float = 2 * math.pi
-    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
+    traits = dataclasses.replace(
+        SourceSum.traits, is_larger_inside=True, has_parameter_derivatives=True
+    )
 
     def __init__(
         self,
@@ -327,6 +340,8 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
         cells: bool | float | None = None,
     ) -> None:
         super().__init__()
+        name = type(self).__name__
+        check_no_derivatives(name, smoothing, accuracy, cells)
         if normals is None:
             raise CloudError(
                 "normals are missing, and without them inside and outside are not known: give "
@@ -335,6 +350,13 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
         if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         self.is_estimated = [isinstance(normals, str), areas is None]  # normals, areas
+        check_estimates(
+            name,
+            {"points": points, "normals": normals},
+            has_normals=not isinstance(normals, str),
+            has_areas=areas is not None,
+        )
+        points, normals, areas = plain_arrays(points, normals, areas)
         if isinstance(normals, str) and normals != "estimate":
             raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
         self.fit_report: dict[str, Any] = {}
@@ -342,7 +364,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
             points, normals, smoothing = self._fitted(points, normals, areas, smoothing)
             # `replace` makes a changed field from the recorded arguments: those of the denoised
             # cloud.
-            record_arguments(self, normals=normals, smoothing=smoothing)
+            record_arguments(self, points=points, normals=normals, smoothing=smoothing)
         if isinstance(normals, str):
             normals = estimate_normals(points)
         # 1.0 is only a valid number for the check, if areas are still to be estimated.
@@ -461,7 +483,6 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
                 stacklevel=4,
             )
 
-    @no_derivatives
     def with_points(
         self, points: Any, normals: Any | Literal["estimate"] = None, areas: Any = None
     ) -> DipolePotential:
@@ -511,6 +532,14 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
             .with_far_field_errors(x, 64, weight)
             .rescaled(data.size)
         )
+
+    def moving_sum(self, backend: Backend) -> MovingDipoles | None:
+        """f as a sum over all dipoles, with derivatives by the points, normals and areas
+        (`BatchedField.moving_sum`)."""
+        frame = UnitFrame(*frame_parameters(backend, self._center, self._size))
+        # With the smoothing length 0, psi_1 is 1/D^3, as for the plain sum.
+        kernel = SmoothedKernel(backend, self.smoothing / self._size)
+        return self._moving_dipoles(frame, kernel, 1.0)
 
     def sharp_values_at(self, x: Vec3) -> PointValues:
         """Compute f and its gradient at points x (3, n), with error bounds. Unless the user chose

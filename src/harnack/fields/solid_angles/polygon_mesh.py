@@ -14,23 +14,36 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import BoolArray, FloatArray, IntArray, choose_backend, to_numpy, to_vector3
-from harnack.backend.arrays import upload_floats, upload_integers
+from harnack.backend import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    backend_of,
+    choose_backend,
+    to_numpy,
+    to_vector3,
+)
+from harnack.backend.arrays import gather_vectors, upload_floats, upload_integers
 from harnack.backend.elementary import fmin
 from harnack.backend.record_table import RecordTable
+from harnack.backend.tensors import is_tensor
+from harnack.backend.validation import check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled
 from harnack.fields.batched_fields import cached_upload
-from harnack.fields.evaluator import Evaluator
+from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Traits
+from harnack.fields.parameters import kept_arguments
 from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
+from harnack.fields.solid_angles.moving_vertices import plain_vertices, vertex_vectors
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fmm.curve_queries import lift_ball, remainder_promises
 from harnack.fmm.edges import (
@@ -41,6 +54,7 @@ from harnack.fmm.edges import (
     sum_over_edges,
     vertex_rounding,
 )
+from harnack.fmm.moving_edges import MovingEdges
 from harnack.fmm.source_sums import SUM_MARGIN
 from harnack.fmm.trail_sums import RayLine, line_rates, lipschitz_along
 from harnack.fmm.unit_frame import UnitFrame
@@ -117,15 +131,31 @@ class FaceLoops:
         )  # fmt: skip
         return cls(RecordTable.upload(backend, heads), edges)
 
-    def face(self, index: Any) -> FaceSolidAngle:
-        """The solid angle of the face with this index. The index may differ from lane to lane."""
+    def face(self, index: Any, moving: Callable[[], FaceEdges] | None = None) -> FaceSolidAngle:
+        """The solid angle of the face with this index. The index may differ from lane to lane.
+        moving: as of `FaceSolidAngle`."""
         row = self.heads.read_record(index)  # self.heads: one record for each face
         backend = self.heads.backend
         integer = backend.UInt32
         # The columns of `upload`: center, size, index of the first record, signed number of
         # records, and the roundings of a point and of the value.
         edges = self.edges.records_of(integer(row[4]), integer(dr.abs(row[5])))
-        return FaceSolidAngle(FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:]))
+        data = FaceData(backend, backend.Array3f(*row[:3]), row[3], edges, *row[5:])
+        return FaceSolidAngle(data, moving, index)
+
+    def moving_edges(self, vertices: Vec3, faces: PolygonFaces) -> FaceEdges:
+        """The edges of all faces between these vertices, which may have derivatives. The unit
+        coordinates of faces are constants."""
+        backend = self.heads.backend
+        row = self.heads.read_record(upload_integers(backend, faces.face_of_corner))
+        center, size = backend.Array3f(*row[:3]), row[3]
+        ends: list[Real] = []
+        for corner in (faces.corners, faces.corners[faces.next_corner]):
+            point = gather_vectors(backend, vertices, upload_integers(backend, corner))
+            ends += [*((point - center) / size)]
+        counts = np.bincount(faces.face_of_corner)
+        first = upload_integers(backend, np.cumsum(counts) - counts)
+        return FaceEdges(tuple(ends), first, upload_integers(backend, counts))
 
 
 @dataclass(frozen=True)
@@ -146,6 +176,25 @@ class FaceData(UnitFrame):
     value_rounding: Real
 
 
+@dataclass(frozen=True)
+class FaceEdges:
+    """The edges of all faces of a mesh, face after face, with derivatives by vertices.
+
+    ends: the coordinates of all starts, and of all ends, six arrays (`MovingEdges`), in unit
+        coordinates of the face of each edge.
+    first, count: for each face the index of its first edge, and the number of its edges.
+    """
+
+    ends: tuple[Real, ...]
+    first: Any
+    count: Any
+
+    def of_faces(self, index: Any) -> tuple[Any, Any]:
+        """The first edge and the number of edges of faces with these indices."""
+        kind = cast("Any", type(self.first))
+        return dr.gather(kind, self.first, index), dr.gather(kind, self.count, index)
+
+
 @dataclass(frozen=True, eq=False)
 class FaceSolidAngle(Evaluator):
     """The evaluator of the solid angle f of the boundary of one face, with period 4 pi. The face
@@ -153,6 +202,9 @@ class FaceSolidAngle(Evaluator):
     f modulo 4 pi.
 
     face: the face, on a backend.
+    moving: a function that returns the edges of all faces, with derivatives by vertices; None if
+        these are not known.
+    index: the index of the face, for each lane.
 
     Its promises, proved bounds of f near a point, are those of `SolidAngle`, which has the proofs.
     They include a ball and a range of the lift on it. The range is that of `lift_bound="convex"` if
@@ -160,6 +212,23 @@ class FaceSolidAngle(Evaluator):
     """
 
     face: FaceData
+    moving: Callable[[], FaceEdges] | None = None
+    index: Any = None
+
+    def differentiable_value(self, p: Vec3) -> Real:
+        """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of faces."""
+        if self.moving is None:
+            return super().differentiable_value(p)
+        edges = self.moving()
+        return MovingEdges(self.face, edges.ends).angle(p, edges.of_faces(self.index))
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        """The gradient of f at points p, as an expression of the same kind."""
+        if self.moving is None:
+            return super().differentiable_gradient(p)
+        edges = self.moving()
+        return MovingEdges(self.face, edges.ends).gradient(p, edges.of_faces(self.index))
 
     def evaluate(self, p: Vec3) -> Sample:
         """A sample of f at points p: value, gradient, error bounds and proved bounds of f near
@@ -460,7 +529,8 @@ class PolygonMesh(PatchField):
     *patch* for each face, the solid angle of that face. Which face is meant may differ from lane to
     lane.
 
-    vertices: (n, 3).
+    vertices: (n, 3); a Dr.Jit 3-vector of n lanes or a tensor, if hits are to be differentiated by
+        them.
     faces: a list of faces. A face is a list of at least three indices of vertices, in
         counter-clockwise order seen from outside; or it is a list of such loops, in which holes run
         clockwise. Faces may have different numbers of corners, and need not be joined.
@@ -478,7 +548,10 @@ class PolygonMesh(PatchField):
 
     period: ClassVar[float | None] = PERIOD
     default_level: float = 2 * math.pi
-    traits = Traits(has_patches=True, over_relaxation=1.3)  # as for `SolidAngle`
+    traits = Traits(  # as for `SolidAngle`
+        has_patches=True, over_relaxation=1.3, has_parameter_derivatives=True
+    )
+    copies_parameters: ClassVar[bool] = True  # `cached_upload`
     no_single_function = (
         "a polygon mesh is no level set of one function, but of one for each face: ask a "
         "face, such as mesh.face(0), which is a harnack.SolidAngle"
@@ -487,7 +560,8 @@ class PolygonMesh(PatchField):
     def __init__(self, vertices: Any, faces: Any) -> None:
         """Validate vertices (n, 3) and faces, a list of polygons: each is a list of indices of
         vertices, or a list of such loops."""
-        self.faces: PolygonFaces = validate_polygons(vertices, faces)
+        check_no_derivatives(type(self).__name__, faces)
+        self.faces: PolygonFaces = validate_polygons(plain_vertices(vertices), faces)
         if self.faces.face_count >= MAX_BOXES:
             raise ValueError(
                 f"{self.faces.face_count:,} faces are too many: at most {MAX_BOXES:,}; cut the "
@@ -509,10 +583,17 @@ class PolygonMesh(PatchField):
         loops = np.split(self.faces.corners, self.faces.loop_starts[1:])
         for owner, loop in zip(self.faces.face_of_loop, loops, strict=True):
             faces[owner].append(loop.tolist())
+        given = self._given_vertices
         return {
-            "vertices": self.vertices,
+            "vertices": self.vertices if given is None else given,
             "faces": [face if len(face) > 1 else face[0] for face in faces],
         }
+
+    @property
+    def _given_vertices(self) -> Any:
+        """The vertices as they were given, if that was as a Dr.Jit array or tensor; else None."""
+        vertices = kept_arguments(self).get("vertices")
+        return vertices if dr.is_array_v(type(vertices)) else None
 
     @property
     def edges(self) -> IntArray:
@@ -526,7 +607,16 @@ class PolygonMesh(PatchField):
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
-        return SolidAngle(self.faces.loops(index))
+        given = self._given_vertices
+        if given is None:
+            return SolidAngle(self.faces.loops(index))
+        backend = backend_of(given.array if is_tensor(given) else given)
+        vertices = vertex_vectors(backend, given, self.vertices)
+        corners = np.split(self.faces.corners, self.faces.loop_starts[1:])
+        loops = [corners[k] for k in np.flatnonzero(self.faces.face_of_loop == index)]
+        return SolidAngle(
+            [gather_vectors(backend, vertices, upload_integers(backend, loop)) for loop in loops]
+        )
 
     def boxes(self, levels: tuple[float, ...] | None = None) -> tuple[FloatArray, FloatArray]:
         """Boxes proved to contain the surfaces of the m faces: their lower and upper corners, both
@@ -543,6 +633,16 @@ class PolygonMesh(PatchField):
         """Copy the boxes of all faces and their boundary curves to a backend."""
         boxes = PatchBoxes.upload(backend, *self.boxes(levels))
         return _FacePatches(boxes, FaceLoops.upload(backend, self.faces))
+
+    def evaluator(self, backend: Backend, plan: Plan = POINTS) -> Evaluator:
+        patches = self._upload(backend, plan.levels or (self.default_level,))
+
+        def moving() -> FaceEdges:
+            """The edges of all faces, with derivatives by vertices."""
+            vertices = vertex_vectors(backend, self._given_vertices, self.vertices)
+            return patches.curves.moving_edges(vertices, self.faces)
+
+        return self.evaluator_of(replace(patches, moving=moving))
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         """Raise ValueError for a level that is a multiple of 4 pi: its surfaces would be
@@ -571,9 +671,12 @@ class _FacePatches(PatchesInBoxes):
     """The faces of a polygon mesh on a backend.
 
     curves: the boundary curves of all faces.
+    moving: a function that returns their edges with derivatives by vertices; None for no
+        derivatives.
     """
 
     curves: FaceLoops
+    moving: Callable[[], FaceEdges] | None = None
 
     def patch(self, index: Any) -> Evaluator:
-        return self.curves.face(index)
+        return self.curves.face(index, self.moving)

@@ -20,13 +20,18 @@ import numpy as np
 
 from harnack.backend import FloatArray, backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import as_positive
+from harnack.backend.validation import as_positive, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, TaylorRemainder
 from harnack.fields.batched_fields import SourceSum, cached_upload
 from harnack.fields.clearance import tight_extent
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.oriented_points import OrientedPoints
+from harnack.fields.solid_angles.oriented_points import (
+    OrientedPoints,
+    check_estimates,
+    plain_arrays,
+)
+from harnack.fmm.moving_dipoles import MovingDipoles
 from harnack.fmm.point_values import PointValues
 from harnack.fmm.radial_kernel import (
     BALL_FRACTION,
@@ -271,6 +276,10 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     should be longer than the distance between neighboring points: else the level sets are those of
     single dipoles.
 
+    Derivatives. Points, normals and areas may be Dr.Jit arrays (3-vectors of n lanes, arrays of n
+    entries) or tensors. Hits, values and gradients can then be differentiated by them
+    (`fmm.moving_dipoles`). The default level is held fixed.
+
     points, normals: (n, 3), normals of any length, to the outside.
     areas: (n,) the areas that the points stand for; None estimates them.
     length: l, in the points' unit.
@@ -298,10 +307,12 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
     took 20 to 65 (spheres and tori of 270 to 2000 points, l from 0.03 to 100).
 
     Raises CloudError (a ValueError) as `validate_cloud`; ValueError for an invalid length, method
-    or accuracy.
+    or accuracy; NotImplementedError for derivatives that would be lost.
     """
 
-    traits = dataclasses.replace(SourceSum.traits, is_larger_inside=True)
+    traits = dataclasses.replace(
+        SourceSum.traits, is_larger_inside=True, has_parameter_derivatives=True
+    )
 
     def __init__(
         self,
@@ -323,12 +334,18 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         accuracy: for the tree; larger is more accurate.
         """
         super().__init__()
+        check_no_derivatives(type(self).__name__, length, method, accuracy)
         length = as_positive(length, "length")
         if method not in ("auto", "sum", "tree"):
             hint = did_you_mean(method, ("auto", "sum", "tree"))
             raise ValueError(f'method is "auto", "sum" or "tree", not {method!r}{hint}')
         if not 2 <= accuracy <= 100:
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
+        name = type(self).__name__
+        self.is_estimated = [False, areas is None]  # normals, areas
+        given = {"points": points, "normals": normals}
+        check_estimates(name, given, has_normals=True, has_areas=areas is not None)
+        points, normals, areas = plain_arrays(points, normals, areas)
         if areas is None:
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))
@@ -422,6 +439,13 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
         terms = 64 if self.method == "tree" else len(self.points)
         return values.with_far_field_errors(x, max(terms, 64), weight).rescaled(data.size)
 
+    def moving_sum(self, backend: Backend) -> MovingDipoles | None:
+        """w as a sum over all dipoles, with derivatives by the points, normals and areas
+        (`BatchedField.moving_sum`)."""
+        frame = UnitFrame(*frame_parameters(backend, self._center, self._size))
+        kernel = YukawaKernel(backend, self._kappa)
+        return self._moving_dipoles(frame, kernel, 1 / (4 * math.pi))
+
     def _ray_data(self, backend: Backend, plan: Plan) -> _ScreenedBuffers:
         del plan
         return self._upload(backend)
@@ -441,7 +465,7 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
             *frame_parameters(backend, self._center, self._size),
             kernel,
             dipoles,
-            float(self._rows[:, 6].sum()),
+            dr.opaque(backend.Float, float(self._rows[:, 6].sum())),
         )
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
@@ -500,7 +524,7 @@ class _ScreenedBuffers(UnitFrame):
 
     kernel: YukawaKernel
     dipoles: RadialSum
-    weight: float
+    weight: Real
 
     @property
     def coarsest_accuracy(self) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 from harnack.backend import FloatArray, backend_of, choose_backend, to_numpy
 from harnack.backend.elementary import fmin
 from harnack.backend.tensors import is_tensor, tensor_to_vectors
-from harnack.backend.validation import check_length_range
+from harnack.backend.validation import check_length_range, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.fields.batch_evaluation import map_batches
@@ -40,7 +40,6 @@ from harnack.fmm.curve_cells import CurveCells, CurveCellSums
 from harnack.fmm.curve_queries import (
     closest_on_segments,
     continuous_change,
-    differentiable_angle,
     gradient_change_bound,
     lift_ball,
     remainder_promises,
@@ -53,6 +52,7 @@ from harnack.fmm.edges import (
     sum_over_edges,
     vertex_rounding,
 )
+from harnack.fmm.moving_edges import MovingEdges
 from harnack.fmm.source_sums import SECOND_ROUNDINGS, SLOPE_ROUNDINGS, SUM_MARGIN
 from harnack.fmm.trail_sums import RayLine, line_rates, lipschitz_along
 from harnack.fmm.unit_frame import UnitFrame, coordinate_rounding, frame_parameters
@@ -94,8 +94,9 @@ class SolidAngle(FieldWithCells):
 
     loops: one (n, 3) array-like of vertices, n >= 3, a `Circle`, or a list of these. Every loop is
         closed by itself. Orientation matters: a hole runs against its outer loop. A loop may be a
-        Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits and values can be differentiated by its
-        vertices. Circles are exact, and cost about as much time as nine vertices.
+        Dr.Jit 3-vector of n lanes or a tensor (n, 3): hits, values and gradients can be
+        differentiated by its vertices (`fmm.moving_edges`), but not by circles. Circles are exact,
+        and cost about as much time as nine vertices.
 
     Edges that are traversed in both directions, by one loop or by two neighbors, are removed before
     anything is computed (`cancel_opposite_edges`): they do not contribute to f. If no edge is left,
@@ -161,6 +162,7 @@ class SolidAngle(FieldWithCells):
             megabytes that they may take.
         """
         super().__init__()
+        check_no_derivatives(type(self).__name__, lift_bound, cells)
         self.circles: tuple[Circle, ...]
         # Loops that are Dr.Jit arrays are kept besides, for derivatives by their vertices.
         curves, self._differentiable_loops = _movable_loops(loops)
@@ -365,11 +367,14 @@ class SolidAngle(FieldWithCells):
         points = np.concatenate([*self._net_loops, *corners]) - center
         return points.min(axis=0) / self._size, points.max(axis=0) / self._size
 
-    @functools.cached_property
+    @property
     def _without_cells(self) -> SolidAngle:
         """The same field without FMM cells; this field itself if it has none."""
-        if not self.cell_choice():
-            return self
+        return self._copy_without_cells if self.cell_choice() else self
+
+    @functools.cached_property
+    def _copy_without_cells(self) -> SolidAngle:
+        """The same field without FMM cells, as another field."""
         return SolidAngle([*self.loops, *self.circles], lift_bound=self.lift_bound_option)
 
     def _evaluate_points(
@@ -714,9 +719,10 @@ class CurveEvaluator(Evaluator):
     def differentiable_value(self, p: Vec3) -> Real:
         """f at points p, modulo 4 pi, as an expression that Dr.Jit can differentiate by p and by
         the vertices of loops."""
-        backend = backend_of(p)
-        angle = differentiable_angle(backend, self.loops, p)
         data = self.data
+        angle = dr.zeros(data.backend.Float, dr.width(p))
+        if self.loops:
+            angle = MovingEdges.of_loops(data, self.loops).angle(p)
         if data.circles is None:
             return angle
         # The part of the circles, to first order in p: reverse mode cannot pass a recorded loop.
@@ -725,6 +731,24 @@ class CurveEvaluator(Evaluator):
             q = dr.detach(p)
             sums = data.circles.sums(data.to_unit(q))
         return angle + sums.angle + dr.dot(sums.gradient / data.size, p - q)
+
+    def differentiable_gradient(self, p: Vec3) -> Vec3 | None:
+        """The gradient of f at points p, as an expression that Dr.Jit can differentiate by p and by
+        the vertices of loops."""
+        data = self.data
+        if not any(map(dr.grad_enabled, self.loops)):
+            return super().differentiable_gradient(p)
+        gradient = MovingEdges.of_loops(data, self.loops).gradient(p)
+        if data.circles is None:
+            return gradient
+        # The part of the circles, to first order in p, by their second derivatives.
+        with dr.suspend_grad():
+            q = dr.detach(p)
+            x, vector = data.to_unit(q), data.backend.Array3f
+            own = data.circles.sums(x).gradient / data.size
+            rows = data.circles.hessian(x).rows(vector)
+        moved = (p - q) / (data.size * data.size)
+        return gradient + own + vector(*(dr.dot(row, moved) for row in rows))
 
     def describe(self) -> dict[str, Any]:
         """The facts of `SolidAngle.describe`, with the number and the memory of the FMM cells that

@@ -27,7 +27,7 @@ from harnack.tree.triangle_tree import MAX_TRIANGLES, PARITY_COLUMN, triangle_re
 _LEAF_SIZE, _ARITY = 8, 4
 # Cached properties that `WindingMesh.with_vertices` keeps. They depend only on the faces; or they
 # are trees, which stay valid, although not optimal, when vertices move.
-_KEPT_PROPERTIES = ("triangles", "tree", "ray_tree", "singular_flags")
+_KEPT_PROPERTIES = ("moving_edges", "triangles", "tree", "ray_tree", "singular_flags")
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,22 @@ class WindingMesh:
         """The vertices (n, 3) in unit coordinates, with the origin at the center of the mesh and a
         size of about one."""
         return (self.vertices - self.center) / self.size
+
+    @functools.cached_property
+    def moving_edges(self) -> IntArray:
+        """The directed edges (k, 2), as indices of the user's vertices, that are left if edges of
+        input faces in opposite directions cancel. They contain `singular_edges`, and also those
+        edges that only cancel because vertices of different indices are at the same place: if these
+        move one by one, they no longer do. An edge of weight 2 occurs twice."""
+        faces, count = self.input_faces, len(self.vertices)
+        ends = np.concatenate([faces[:, (k, (k + 1) % 3)] for k in range(3)])
+        is_forward = ends[:, 0] < ends[:, 1]
+        keys = ends.min(axis=1) * count + ends.max(axis=1)
+        keys, index = np.unique(keys, return_inverse=True)
+        weights = np.bincount(index.ravel(), np.where(is_forward, 1, -1)).astype(np.int64)
+        low, high = keys // count, keys % count
+        pairs = np.where(weights[:, None] > 0, np.stack([low, high], 1), np.stack([high, low], 1))
+        return np.repeat(pairs, np.abs(weights), axis=0)
 
     @functools.cached_property
     def triangles(self) -> IntArray:

@@ -32,8 +32,9 @@ import numpy as np
 import numpy.typing as npt
 
 from harnack.backend import FloatArray, IntArray, backend_of
+from harnack.backend.arrays import upload_integers
 from harnack.backend.elementary import fmax
-from harnack.backend.validation import as_integer_in_range, as_real, no_derivatives
+from harnack.backend.validation import as_integer_in_range, as_real, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
 from harnack.fields.batch_evaluation import evaluate_points
@@ -43,18 +44,25 @@ from harnack.fields.capabilities import (
     JumpCrossing,
     Jumps,
     ModuloOne,
+    MovingTriangles,
     NearestFacet,
     VariableAccuracy,
 )
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.field import Field, Sample, Traits, space_scaled
+from harnack.fields.parameters import kept_arguments, record_arguments
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import (
     NO_CELLS,
     BuiltCells,
     CellChoice,
     FieldWithCells,
+)
+from harnack.fields.solid_angles.moving_vertices import (
+    MovingWinding,
+    plain_vertices,
+    vertex_vectors,
 )
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
@@ -142,7 +150,7 @@ def winding_cells(
     """A grid over the volume `extent`, whose cells are marked as occupied or empty. One is empty if
     the winding number w modulo 1 is proved to take none of the levels in it; triangles do not
     matter. cells: the FMM cells from which samples of w come."""
-    return occupied_cells(WindingModuloOne(winding, cells), levels, extent, _CELLS_ACROSS)
+    return occupied_cells(WindingModuloOne(winding.detached, cells), levels, extent, _CELLS_ACROSS)
 
 
 def winding_extent(winding: WindingNumber, levels: tuple[float, ...]) -> Volume | None:
@@ -167,7 +175,7 @@ def winding_extent(winding: WindingNumber, levels: tuple[float, ...]) -> Volume 
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     lower, upper = box.bounds()
     return tight_extent(
-        WindingModuloOne(winding, NO_CELLS),
+        WindingModuloOne(winding.detached, NO_CELLS),
         levels,
         lower,
         upper,
@@ -247,7 +255,9 @@ class WindingNumber(FieldWithCells, BatchedField):
     jumps by integers across them. The surface w = 1/2 is the mesh itself where the mesh is sound,
     and spans its holes. Faces are counter-clockwise seen from outside.
 
-    vertices: (n, 3).
+    vertices: (n, 3). They may be a Dr.Jit 3-vector of n lanes, or a tensor: hits, values and
+        gradients can then be differentiated by them (`moving_vertices.MovingWinding`). Hits on
+        triangles move with their planes.
     faces: (m, 3) indices into them.
     method: "exact" (`edge_lift`: no truncation, time by the number of singular edges), "tree"
         (`winding_tree`), or "auto": exact up to 2048 singular edges.
@@ -285,7 +295,8 @@ class WindingNumber(FieldWithCells, BatchedField):
 
     period: ClassVar[float | None] = None
     default_level: float = 0.5
-    traits = Traits(has_jumps=True, is_larger_inside=True)
+    traits = Traits(has_jumps=True, is_larger_inside=True, has_parameter_derivatives=True)
+    copies_parameters: ClassVar[bool] = True  # `cached_upload`
 
     def __init__(
         self,
@@ -307,13 +318,14 @@ class WindingNumber(FieldWithCells, BatchedField):
         cells: whether to build FMM cells: True, False, None if they save time, or the number of
             megabytes that they may take.
         """
+        check_no_derivatives(type(self).__name__, faces, method, accuracy, order, cells)
         if not is_one_of(method, ("auto", "exact", "tree")):
             hint = did_you_mean(method, ("auto", "exact", "tree"))
             raise ValueError(f'method is "auto", "exact" or "tree", not {method!r}{hint}')
         if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         order = as_integer_in_range(order, "order", 0, 2)
-        self._mesh = WindingMesh.of(vertices, faces)
+        self._mesh = WindingMesh.of(plain_vertices(vertices), faces)
         has_few_edges = len(self.mesh.singular_edges) <= _MAX_EXACT_EDGES
         self._method: Literal["exact", "tree"] = (
             ("exact" if has_few_edges else "tree") if method == "auto" else method
@@ -328,7 +340,6 @@ class WindingNumber(FieldWithCells, BatchedField):
             TransientCache()
         )
 
-    @no_derivatives
     def with_vertices(self, vertices: Any) -> WindingNumber:
         """The winding number of the same faces with other positions of their vertices (n, 3). This
         takes less time than a new field.
@@ -341,11 +352,26 @@ class WindingNumber(FieldWithCells, BatchedField):
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
         field = copy.copy(self)
-        field._mesh = self.mesh.with_vertices(vertices)
+        field._mesh = self.mesh.with_vertices(plain_vertices(vertices))
+        record_arguments(field, vertices=vertices)  # they may have derivatives
+        vars(field).pop("_detached_copy", None)
         # What was computed from the old positions is dropped.
         field._extents, field._occupied = TransientCache(), TransientCache()
         field._own_levels = TransientCache()
         field.configure_cells(self.cells)
+        return field
+
+    @property
+    def detached(self) -> WindingNumber:
+        """The same field without derivatives by its vertices; this field itself if it was given
+        NumPy arrays."""
+        return self if self._given_vertices is None else self._detached_copy
+
+    @functools.cached_property
+    def _detached_copy(self) -> WindingNumber:
+        """The same field without derivatives by its vertices, as another field."""
+        field = copy.copy(self)
+        record_arguments(field, vertices=self.mesh.vertices)
         return field
 
     @property
@@ -369,8 +395,29 @@ class WindingNumber(FieldWithCells, BatchedField):
 
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of the constructor by name."""
-        mesh = {"vertices": self.mesh.vertices, "faces": self.mesh.input_faces}
+        vertices = self._given_vertices
+        mesh = {
+            "vertices": self.mesh.vertices if vertices is None else vertices,
+            "faces": self.mesh.input_faces,
+        }
         return {**super().constructor_arguments(), **mesh}
+
+    @property
+    def _given_vertices(self) -> Any:
+        """The vertices as they were given, if that was as a Dr.Jit array or tensor; else None."""
+        vertices = kept_arguments(self).get("vertices")
+        return vertices if dr.is_array_v(type(vertices)) else None
+
+    def moving_vertices(self, backend: Backend) -> Vec3:
+        """The vertices as a 3-vector of a backend, with their derivatives if they have some."""
+        return vertex_vectors(backend, self._given_vertices, self.mesh.vertices)
+
+    def moving_sum(self, backend: Backend) -> MovingWinding | None:
+        """w on a backend with derivatives by vertices (`BatchedField.moving_sum`)."""
+        vertices = self._given_vertices
+        if vertices is None or not dr.grad_enabled(vertices):
+            return None
+        return MovingWinding.of(self, backend)
 
     def values_at(self, x: Vec3, derivatives: int, closer: Real = 1.0) -> PointValues:
         """w at points x (3, n) in user coordinates, and its derivatives up to order `derivatives`
@@ -737,6 +784,14 @@ class _TriangleJumps(Jumps):
             facet.squared_distance, facet.triangle, facet.offset * data.size, normal, is_inner
         )
 
+    def moving_triangles(self) -> MovingTriangles:
+        """The triangles between the user's vertices, which may have derivatives."""
+        mesh, backend = self.field.mesh, self.data.backend
+        # The vertices of input faces: those of `mesh.faces` may stand for several of the user's.
+        faces = mesh.input_faces[mesh.input_face]
+        a, b, c = (upload_integers(backend, faces[:, k]) for k in range(3))
+        return MovingTriangles(self.field.moving_vertices(backend), (a, b, c))
+
     def mesh(self) -> tuple[FloatArray, IntArray, bool] | None:
         """The mesh at which w jumps: vertices (n, 3), triangles (k, 3), and whether the mesh is
         closed. It is never None here."""
@@ -748,7 +803,7 @@ class _TriangleJumps(Jumps):
 
     def smooth_field(self) -> Field | None:
         """The winding number modulo 1, which is continuous across triangles; never None here."""
-        return WindingModuloOne(self.field, self.cells)
+        return WindingModuloOne(self.field.detached, self.cells)
 
     def are_whole_surface(self, levels: tuple[float, ...]) -> bool:
         """Whether the surface of these levels is the mesh itself."""
