@@ -46,7 +46,12 @@ from harnack.inverse.discontinuities import (
 from harnack.inverse.film import has_fixed_pose, pixel_indices
 from harnack.inverse.scanline_samples import scanline_samples
 from harnack.name_suggestions import with_article
-from harnack.tracer.derivatives import change_of_nearest_level, change_of_value, needs_derivatives
+from harnack.tracer.derivatives import (
+    change_of_nearest_level,
+    change_of_value,
+    hits_on_level,
+    needs_derivatives,
+)
 from harnack.tracer.hits import MIN_RAYS_FOR_CELLS, hits_with_derivatives
 from harnack.tracer.level_contact import HitTolerance, RayStatus
 from harnack.tracer.rays import RayBatch
@@ -191,7 +196,25 @@ class Drawing:
         with dr.suspend_grad():
             rays = self._rays(points, self._fine_tracer.backend)
             hits, _ = hits_with_derivatives(self._fine_tracer, rays)
-            return self._seen(hits, rays)
+            return self._seen(self._on_level(hits, rays), rays)
+
+    def _on_level(self, hits: Hits, rays: RayBatch) -> Hits:
+        """The hits of rays, moved from within the tolerance onto the level: near the curves at
+        which level sets end, normals depend on it. Hits on facets and patches are exact already."""
+        traits = self.surface.field.traits
+        if traits.has_jumps or traits.has_patches:
+            return hits
+        tracer, is_hit = self._fine_tracer, hits.is_hit
+        _, t, x, sample = hits_on_level(
+            tracer, rays.origin, rays.direction, hits.t, is_hit, longest_step=_LONGEST_STEP
+        )
+        length = safe_norm(sample.gradient)
+        return replace(
+            hits,
+            t=dr.select(is_hit, t, hits.t),
+            position=dr.select(is_hit, x, hits.position),
+            normal=dr.select(is_hit & (length > 0), sample.gradient / length, hits.normal),
+        )
 
     def _seen(self, hits: Hits, rays: RayBatch) -> Seen:
         """What rays with these hits see, as NumPy arrays."""

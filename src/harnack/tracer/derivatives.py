@@ -42,6 +42,7 @@ from harnack.tracer.level_contact import RayStatus
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real, Vec3
+    from harnack.fields.field import Sample
     from harnack.tracer.surface_tracer import MarchResult, SurfaceTracer
 
 # Newton steps that bring a hit from the tolerance to rounding before the derivative is taken; and
@@ -149,28 +150,10 @@ def attach_derivatives(
         is_hit &= ~end.at_jump
     backend = tracer.backend
     with dr.suspend_grad():
-        t_hit = dr.select(is_hit, t, 0)
-        origin, direction = dr.detach(o), dr.detach(d)
-        steps = _NEWTON_STEPS
-        accuracy = tracer.evaluator.variable_accuracy
-        if accuracy is not None:
-            # Truncation is as large as the tolerance, and its derivative may be much larger.
-            steps = _NEWTON_STEPS_OF_SUMS
-            # Hits are sampled without truncation; other rays do not matter (0 is the coarsest).
-            scale = dr.select(is_hit, backend.Float(EXACT), 0)
-            tracer = replace(tracer, evaluator=accuracy.at(scale))
-        for _ in range(steps):
-            x = dr.fma(backend.Array3f(t_hit), direction, origin)
-            sample = tracer.sample(x)
-            # The level minus f, and the derivative of f along the ray: Newton's step.
-            offset = tracer.levels.offset_to_nearest(sample.value)
-            slope = dr.dot(sample.gradient, direction)
-            step = dr.select(is_hit & (slope != 0), offset / slope, 0)
-            # A grazing ray may have no root to converge to; stay near the proved point.
-            limit = longest_step * tracer.tolerance.distance
-            t_hit = t_hit + dr.clip(step, -limit, limit)
-        x = dr.fma(backend.Array3f(t_hit), direction, origin)
-        sample = tracer.sample(x)
+        direction = dr.detach(d)
+        tracer, t_hit, x, sample = hits_on_level(
+            tracer, dr.detach(o), direction, t, is_hit, longest_step=longest_step
+        )
         slope = dr.dot(sample.gradient, direction)
         length = norm(sample.gradient)
         normal = dr.select(is_hit & (length > 0), sample.gradient / length, normal)
@@ -183,6 +166,40 @@ def attach_derivatives(
     if corners is not None:
         normal = dr.select(end.at_jump, _with_facet_derivative(normal, corners), normal)
     return t, normal
+
+
+def hits_on_level(
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, t: Real, is_hit: Mask, *, longest_step: float
+) -> tuple[SurfaceTracer, Real, Vec3, Sample]:
+    """Move hits from within the tolerance onto the level, by Newton's method along their rays.
+
+    o, d, t: origins and directions (3,) of the rays, and ray parameters.
+    is_hit: the rays that hit; others stay at t = 0.
+    longest_step: the longest step, in tolerances.
+
+    Returns the tracer, whose samples have no truncation error now; the new t; the points (3,); and
+    the samples there.
+    """
+    backend, steps = tracer.backend, _NEWTON_STEPS
+    accuracy = tracer.evaluator.variable_accuracy
+    if accuracy is not None:
+        # Truncation is as large as the tolerance, and its derivative may be much larger.
+        steps = _NEWTON_STEPS_OF_SUMS
+        # Hits are sampled without truncation; other rays do not matter (0 is the coarsest).
+        scale = dr.select(is_hit, backend.Float(EXACT), 0)
+        tracer = replace(tracer, evaluator=accuracy.at(scale))
+    t = dr.select(is_hit, t, 0)
+    for _ in range(steps):
+        sample = tracer.sample(dr.fma(backend.Array3f(t), d, o))
+        # The level minus f, and the derivative of f along the ray: Newton's step.
+        offset = tracer.levels.offset_to_nearest(sample.value)
+        slope = dr.dot(sample.gradient, d)
+        step = dr.select(is_hit & (slope != 0), offset / slope, 0)
+        # A grazing ray may have no root to converge to; stay near the proved point.
+        limit = longest_step * tracer.tolerance.distance
+        t = t + dr.clip(step, -limit, limit)
+    x = dr.fma(backend.Array3f(t), d, o)
+    return tracer, t, x, tracer.sample(x)
 
 
 def _with_normal_derivative(
