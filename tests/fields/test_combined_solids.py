@@ -442,3 +442,12 @@ def test_the_radius_of_a_blend_is_a_number_of_the_kernel_only() -> None:
     for radius in (0.5, 0.05):
         blend = hk.Sphere(0.5).blended(hk.Cuboid((1.0, 0.2, 0.2)), radius)
         assert not blend.evaluator(backend).is_steep
+
+
+def test_what_is_no_solid_is_told_how_to_become_one() -> None:
+    with pytest.raises(TypeError, match="offset"):
+        hk.Sphere(1.0) - 0.1  # type: ignore[operator]
+    with pytest.raises(TypeError, match=r"struts\(radius\)"):
+        hk.Sphere(1.0) & hk.lattice.cubic(1.0, 2)  # type: ignore[operator]
+    with pytest.raises(TypeError, match=r"domain=Ball"):
+        hk.expression("x + y", clip=hk.Ball())

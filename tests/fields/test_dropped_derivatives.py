@@ -119,7 +119,10 @@ ATTACHED = {
     },
     "Solid.blended": ("other", "radius", "power", "intersect"), "Solid.offset": ("distance",),
     "Solid.translated": ("offset",), "Solid.rotated": ("degrees", "axis"),
-    "Solid.scaled": ("factors",),
+    "Solid.scaled": ("factors",), "Solid.shell": ("thickness",), "Solid.transformed": ("matrix",),
+    "Solid.twisted": ("rate", "axis"), "Solid.tapered": ("start", "end", "axis"),
+    "Solid.arranged": ("transforms",), "Solid.repeated": ("period", "counts"),
+    "Solid.mirrored": ("normal", "offset"), "Solid.around": ("count", "axis"),
 }  # fmt: skip
 
 
@@ -163,10 +166,23 @@ GIVEN: dict[str, Any] = {
     "step": 0.1,
     "length": 1.0,
     "max_crossings": 2,
+    "nodes": POINTS,
+    "edges": [[0, 1], [1, 2]],
+    "radius": 0.1,
 }
 # What results have derivatives by, or do not depend on: where rays begin and end moves no hit.
 WITH_DERIVATIVES = (
-    {("Surface", "field"), ("Surface", "level")}
+    {
+        ("Surface", "field"),
+        ("Surface", "level"),
+        ("signed_distance", "points"),
+        ("smooth_union", "radius"),
+        ("smooth_union", "power"),
+        ("struts", "nodes"),
+        ("struts", "radius"),
+        ("struts", "smooth"),
+        *(("solid", name) for name in ("below", "above", "between", "around")),
+    }
     | {
         (name, argument)
         for name in ("trace", "crossings")
@@ -336,6 +352,7 @@ def test_each_result_of_a_trace_has_its_derivative_or_refuses_it(
     h = 1e-5
     ends = [traced(max_crossings, source, start + s * motion, enabled=False)[1] for s in (h, -h)]
     known = {"t", "position", "normal"}
+    known |= {"value"} if source == "level" and max_crossings is None else set()
     right = set()
     for name, result in vars(hits).items():
         if not dr.is_float_v(result):
@@ -345,6 +362,10 @@ def test_each_result_of_a_trace_has_its_derivative_or_refuses_it(
         change = [objective(getattr(end, name), WEIGHTS)[0] for end in ends]
         expected = (change[0] - change[1]) / (2 * h)
         dr.set_grad(array, 0)
+        if name == "value" and source != "level":  # it is the level
+            dr.backward(objective(result, WEIGHTS), dr.ADFlag.ClearInterior)
+            assert not np.array(dr.grad(array)).any()
+            continue
         if name not in known:
             with pytest.raises(NotImplementedError, match=f"^{name} of hits cannot be diff"):
                 dr.backward(objective(result, WEIGHTS), dr.ADFlag.ClearInterior)

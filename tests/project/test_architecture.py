@@ -51,6 +51,7 @@ FIELD_ROOMS = (
     "operators",
     "batch_evaluation",
     "evaluator",
+    "number_table",
     "attached_numbers",
     "attached_arrays",
     "field",

@@ -352,3 +352,19 @@ def test_reverse_mode_passes_every_field(name: str) -> None:
     dr.backward(dr.sum(field.value(points)))
     expected = field.gradient(0.6 * o, precision="double")
     np.testing.assert_allclose(numpy(dr.grad(points)), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_values_of_hits_move_with_the_level_alone() -> None:
+    from drjit.llvm.ad import Array3f64, Float64
+
+    x, level, radius = Float64([0.3, 3.0]), Float64(0.1), Float64(0.9)
+    dr.enable_grad(x, level, radius)
+    surface = hk.Sphere(radius)
+    hits = hk.trace(surface, Array3f64(x, 0.0, 3.0), Array3f64(0, 0, -1), level=level)
+    dr.backward(dr.select(hits.is_hit, hits.value, 0))
+    np.testing.assert_allclose(dr.grad(level), [1.0])
+    assert not np.any(dr.grad(x))
+    assert not np.any(dr.grad(radius))
+    hits = hk.trace(surface, Array3f64(x, 0.0, 3.0), Array3f64(0, 0, -1), level=level)
+    with pytest.raises(NotImplementedError, match="but at smooth hits"):
+        dr.backward(hits.value)

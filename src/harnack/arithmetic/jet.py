@@ -583,8 +583,9 @@ class Dual(FormulaNumber):
         real = cast("Any", type(self.value))
 
         def rule(a: Any) -> Any:
-            """Compute the partial derivative of the result, from that of this function, a."""
-            return dr.select(real(a) == 0, 0, a * slope)
+            """Compute the partial derivative of the result, from that of this function, a. (Where a
+            is 0 only at this point, it still has derivatives by the numbers of the formula.)"""
+            return a * dr.select((real(a) == 0) & ~dr.isfinite(slope), 0, slope)
 
         return Dual(function.on_drjit(self.value), _map_partials(rule, self.first_derivatives))
 

@@ -16,6 +16,8 @@ import drjit as dr
 import numpy as np
 
 from harnack.arithmetic.functions import absolute, length_bound, power, sqrt_range
+from harnack.arithmetic.functions import exp as exp_function
+from harnack.arithmetic.functions import log as log_function
 from harnack.arithmetic.interval import Interval
 from harnack.arithmetic.jet import Jet, wronskian_range
 from harnack.arithmetic.operators import FormulaNumber
@@ -100,6 +102,8 @@ def norm(*values: Any, p: float = 2.0) -> Any:
     """
     if not values:
         raise TypeError("norm needs a number or more")
+    if dr.is_array_v(cast("Any", type(p))):
+        return _norm_of_any_power(values, p)
     if not p >= 1.0:
         raise ValueError(f"the p of a norm must be at least 1, not {p!r}")
     if len(values) == 1 or math.isinf(p):
@@ -125,6 +129,29 @@ def norm(*values: Any, p: float = 2.0) -> Any:
         return _plain_norm(values, p)
     operands = [term if isinstance(term, Jet) else jets[0].coerce(term) for term in values]
     return _jet_norm(operands, p)
+
+
+# Logarithms are taken of numbers that are at least this.
+_SMALLEST = {dr.VarType.Float32: 1e-30, dr.VarType.Float64: 1e-200}
+
+
+def _norm_of_any_power(values: tuple[Any, ...], p: Any) -> Any:
+    """The p-norm, whose power p is a number of Dr.Jit with derivatives, by exp(p log |x|). The
+    values are Dr.Jit or dual numbers."""
+    smallest = _SMALLEST[dr.type_v(p)]
+
+    def to_power(x: Any, exponent: Any) -> Any:
+        """The power of a number x >= 0."""
+        scaled = log_of(maximum(x, smallest)) * exponent
+        return scaled.apply(exp_function) if isinstance(scaled, FormulaNumber) else dr.exp(scaled)
+
+    def log_of(x: Any) -> Any:
+        """The logarithm of a number x > 0."""
+        return x.apply(log_function) if isinstance(x, FormulaNumber) else dr.log(x)
+
+    powers = [to_power(absolute(x), p) for x in values]
+    powers.sort(key=lambda x: not isinstance(x, FormulaNumber))
+    return to_power(functools.reduce(lambda a, b: a + b, powers), 1 / p)
 
 
 def _plain_norm(values: tuple[Any, ...], p: float) -> Any:

@@ -9,20 +9,25 @@ import copy
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import drjit as dr
 import numpy as np
 
-from harnack.backend import FloatArray, choose_backend
-from harnack.backend.validation import no_derivatives
+from harnack.backend import FloatArray, backend_of, choose_backend
+from harnack.backend.arrays import upload_floats
+from harnack.backend.tensors import accepts_tensors, is_tensor
+from harnack.backend.validation import check_no_derivatives, no_derivatives
 from harnack.cluster.dask_arrays import accepts_dask_arrays
 from harnack.distance.closest_point_search import ClosestPoints, find_closest
+from harnack.distance.distance_derivatives import distance_with_derivative
 from harnack.distance.tangent_plane import first_order_distance, in_batches, second_order_distance
 from harnack.enclosures import Levels
 from harnack.fields.clearance import level_distance_lower_bound
 from harnack.fields.evaluator import Evaluator
-from harnack.fields.field import Field
+from harnack.fields.field import Field, refuse_hidden_parameters
+from harnack.fields.number_table import plain_numbers
+from harnack.fields.parameters import differentiable_parameters
 from harnack.name_suggestions import did_you_mean, is_one_of, with_article
 from harnack.progress import ProgressFunction, show_progress
 from harnack.tracer import TracedSurface, TraceOptions
@@ -45,7 +50,6 @@ _RAY_TOLERANCE = 1e-15
 
 @accepts_dask_arrays("points")
 @shows_keywords(*_HONORED)
-@no_derivatives
 def signed_distance(
     surface: Field | Surface,
     points: Any,
@@ -54,9 +58,15 @@ def signed_distance(
     progress: bool | ProgressFunction = False,
     options: TraceOptions | None = None,
     **keywords: Unpack[TraceKeywords],
-) -> FloatArray:
+) -> Any:
     """Return signed distances (n,) from points (n, 3) to a surface, negative inside. The surface is
     a level set of a field's function f.
+
+    Points that are a Dr.Jit 3-vector give a Dr.Jit array, and a tensor (n, 3) gives a tensor (n,).
+    Those of the method "closest_point" have derivatives: by the points, which are unit vectors; and
+    by the parameters of the field and the level, where the surface is smooth at the closest point.
+    (At a crease or an end of the surface, using a derivative by parameters raises an error in
+    reverse mode, and is NaN in forward mode.)
 
     Points with f < level are inside. For winding numbers, clouds and blobs, which are larger inside
     (`Traits.is_larger_inside`), points with f > level are inside. (trimesh has the opposite sign.)
@@ -95,12 +105,26 @@ def signed_distance(
         TypeError, ValueError: points that are not an (n, 3) array of finite numbers, an unknown
             method, a level that no surface has or, with "lower_bound", points outside the field's
             domain, where it promises nothing.
-        NotImplementedError: "second_order" with a field that has no second derivatives.
+        NotImplementedError: "second_order" with a field that has no second derivatives; or
+            derivatives that would be lost.
     """
     if not is_one_of(method, get_args(Method)):
         names = ", ".join(f'"{name}"' for name in get_args(Method))
         hint = did_you_mean(method, get_args(Method))
         raise ValueError(f"unknown method {method!r}; choose one of {names}{hint}")
+    is_drjit = dr.is_array_v(cast("Any", type(points)))
+    if method == "closest_point" and is_drjit:
+        take = accepts_tensors(_distance_of_vectors)
+        settings = {"progress": progress, "options": options, "keywords": keywords}
+        return take(surface, points, **settings)
+    check_no_derivatives(f'signed_distance(method="{method}")', surface, points, keywords)
+    if is_drjit:
+        result = signed_distance(
+            surface, plain_numbers(points).reshape(-1, 3), method=method, progress=progress,
+            options=options, **keywords,
+        )  # fmt: skip
+        kind = cast("Any", type(points))
+        return kind(result) if is_tensor(points) else upload_floats(backend_of(points), result)
     traced, backend = _surface("signed_distance", surface, options, keywords)
     field = traced.field
     if method == "closest_point":
@@ -125,6 +149,28 @@ def signed_distance(
         jump_distance = find_closest(backend, traced, levels, x, lambda message: None).distance
         result = np.copysign(np.fmin(jump_distance, np.abs(result)), result)
     return _outwards(field) * result
+
+
+def _distance_of_vectors(
+    surface: Any, points: Vec3, *, progress: Any, options: Any, keywords: Any
+) -> Real:
+    """The signed distances of Dr.Jit points by their closest points, with derivatives."""
+    backend = backend_of(points)
+    x = plain_numbers(points).reshape(-1, 3)
+    traced, search_backend = _surface("signed_distance", surface, options, keywords)
+    field = traced.field
+    refuse_hidden_parameters(field)
+    parameters = [v for v in differentiable_parameters(field) if dr.grad_enabled(v)]
+    if field.traits.has_jumps:
+        check_no_derivatives(f"the distance from {with_article(type(field).__name__)}", parameters)
+    with dr.suspend_grad():
+        closest = _find("signed_distance", traced, search_backend, x, progress)
+    sign = _outwards(field)
+    distance = sign * np.copysign(closest.distance, closest.signed_value)
+    return distance_with_derivative(
+        field, traced.evaluator(backend), traced.target_levels(backend), points,
+        closest.closest, distance, sign,
+    )  # fmt: skip
 
 
 def _outwards(field: Field) -> float:

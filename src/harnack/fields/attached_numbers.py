@@ -9,17 +9,22 @@ are, and nothing that was computed of them in Python: this would have no derivat
 from __future__ import annotations
 
 import copy
+import dataclasses
+import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
+import numpy as np
 
 from harnack.arithmetic.jet import Dual
-from harnack.backend import backend_of
 from harnack.backend.elementary import max_norm
+from harnack.backend.validation import has_derivatives
 from harnack.fields.evaluator import Evaluator
+from harnack.fields.number_table import AlikeParts, NumberReader, NumberRecorder, NumberTable
 from harnack.fields.parameters import (
     ATTACHED,
     attributes_of,
@@ -33,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = [
     "attached",
     "attached_vector",
+    "extreme_of_parts",
     "gradient_with_parameters",
     "has_own_formula",
     "own_formula",
@@ -110,27 +116,71 @@ def refuse_moving_domain(field: Any) -> None:
 
 
 def _formula_of_attached(field: Any, p: Vec3) -> Callable[[Any, Any, Any], Any]:
-    """The formula of a field with its numbers attached, on the backend of points p."""
+    """The formula of a field with its numbers attached, for the lanes of points p."""
     if hasattr(field, "formula"):
         own_formula(field)  # raises an error if a user's class has another function
-    return attached(field, backend_of(p)).formula
+    return attached(field, NumberTable.of(field, p)).formula
 
 
-def attached(value: Any, backend: Backend) -> Any:
+def attached(value: Any, numbers: NumberReader) -> Any:
     """A copy of a field, in which arguments with derivatives are in place of the attributes that
     hold their numbers, in the fields that it is made of as well; or the copy of what contains
     fields."""
     if isinstance(value, tuple):
-        return tuple(attached(entry, backend) for entry in cast("tuple[Any, ...]", value))
-    if ATTACHED not in getattr(value, "__dict__", {}):
-        return value
-    own = getattr(value, "with_attached_numbers", None)
+        return tuple(attached(entry, numbers) for entry in cast("tuple[Any, ...]", value))
+    # Of parts that are alike, the numbers of all are read.
+    traits: Any = getattr(value, "traits", None)
+    is_read = not isinstance(numbers, NumberTable) and bool(
+        traits is not None and traits.differentiable_arguments
+    )
+    if not is_read and ATTACHED not in getattr(value, "__dict__", {}):
+        return _SampledPart.of(value, numbers) if hasattr(value, "evaluator") else value
+    own = getattr(value, "with_read_numbers", None)
     if own is not None:
-        return own(backend)
-    return with_attached_arguments(value, value.traits.differentiable_arguments, backend)
+        return own(numbers)
+    own = getattr(value, "with_attached_numbers", None)  # of a class that reads its numbers itself
+    if own is not None:
+        return own(cast("NumberTable", numbers).backend)
+    return with_attached_arguments(value, value.traits.differentiable_arguments, numbers)
 
 
-def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend) -> Any:
+@dataclass(frozen=True, eq=False)
+class _SampledPart:
+    """A field without numbers with derivatives, and without a formula of plain numbers, as a part
+    of one with such numbers: its function is sampled."""
+
+    evaluator: Evaluator
+    vector: Any
+
+    @classmethod
+    def of(cls, field: Any, numbers: NumberReader) -> Any:
+        """The field itself if it has a formula, or such a part."""
+        try:
+            own_formula(field)(0.1, 0.2, 0.3)
+        except (AttributeError, TypeError):
+            backend = cast("NumberTable", numbers).backend
+            return cls(field.evaluator(backend), backend.Array3f)
+        return field
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at coordinates that are Dr.Jit or dual numbers."""
+        dual = next((v for v in (x, y, z) if isinstance(v, Dual)), None)
+        if dual is None:
+            return self.evaluator.differentiable_value(self.vector(x, y, z))
+        coordinates = [dual.coerce(v) for v in (x, y, z)]
+        point = self.vector(*(v.value for v in coordinates))
+        gradient = self.evaluator.differentiable_gradient(point)
+        if gradient is None:
+            raise TypeError(f"second derivatives of {self.evaluator.name} are not known")
+        slopes = [
+            sum(gradient[k] * coordinates[k].first_derivatives[i] for k in range(3))
+            for i in range(3)
+        ]
+        value = self.evaluator.differentiable_value(point)
+        return Dual(value, (slopes[0], slopes[1], slopes[2]))
+
+
+def with_attached_arguments(field: Any, names: tuple[str, ...], numbers: NumberReader) -> Any:
     """The copy of a field with its arguments of these names attached (`attached`)."""
     other, kept = copy.copy(field), kept_arguments(field)
     for name in list(attributes_of(other)):
@@ -139,27 +189,105 @@ def with_attached_arguments(field: Any, names: tuple[str, ...], backend: Backend
             inspect.getattr_static(cast("Any", type(field)), name, None), cached_property
         ):
             del attributes_of(other)[name]
+    literals: tuple[str, ...] = getattr(field, "literals", ())
     for name in names:
         number = kept.get(name)
         old = getattr(field, name)
+        if name in literals and not has_derivatives(number):
+            continue
         if isinstance(old, Mapping):
             own: dict[str, Any] = number or {}
             entries = cast("Any", old).items()
-            new: Any = {k: _attached_number(own.get(k, e), e, backend) for k, e in entries}
+            new: Any = {k: _attached_number(own.get(k, e), e, numbers) for k, e in entries}
         else:
-            new = _attached_number(old if number is None else number, old, backend)
+            new = _attached_number(old if number is None else number, old, numbers)
         object.__setattr__(other, name, new)
     return other
 
 
-def _attached_number(argument: Any, stored: Any, backend: Backend) -> Any:
+def _attached_number(argument: Any, stored: Any, numbers: NumberReader) -> Any:
     """An argument of the constructor in the form of `stored`, the attribute that holds it: a
     number, a tuple of numbers or what contains fields."""
     if isinstance(stored, float):
-        return attached_vector(argument, [stored], backend)[0] if _has_array(argument) else stored
-    if isinstance(stored, tuple) and _has_array(argument):
-        return attached_vector(argument, cast("Any", stored), backend)
-    return attached(stored, backend)
+        return numbers.vector(argument, [stored])[0]
+    if _is_numbers(stored):
+        return numbers.vector(argument, stored)
+    return attached(stored, numbers)
+
+
+def _is_numbers(value: Any) -> bool:
+    """Whether a value is a tuple of floats."""
+    entries = cast("tuple[Any, ...]", value) if isinstance(value, tuple) else ()
+    return bool(entries) and all(isinstance(entry, float) for entry in entries)
+
+
+# So many parts with formulas that are alike are evaluated as one.
+_MIN_ALIKE = 4
+
+
+def extreme_of_parts(
+    parts: tuple[Any, ...], numbers: NumberReader, *, is_least: bool
+) -> tuple[Any, ...]:
+    """The fields `parts` with their numbers attached, of which the least or greatest function
+    counts. Of those whose formulas are alike, `AlikeParts` takes the place."""
+    if not isinstance(numbers, NumberTable):
+        return attached(parts, numbers)
+    groups: dict[Any, list[Any]] = {}
+    for number, part in enumerate(parts):
+        shape = _shape_of(part)
+        groups.setdefault((number,) if shape is None else shape, []).append(part)
+    new: list[Any] = []
+    for group in groups.values():
+        # What has no derivatives is left as it is, unless it is many.
+        if len(group) < _MIN_ALIKE:
+            new += attached(tuple(group), numbers)
+            continue
+        recorders = [NumberRecorder(numbers) for _ in group]
+        for part, recorder in zip(group, recorders, strict=True):
+            attached(part, recorder)
+        new.append(
+            AlikeParts(
+                numbers,
+                np.array([recorder.values for recorder in recorders]),
+                np.array([recorder.places for recorder in recorders]),
+                functools.partial(attached, group[0]),
+                is_least=is_least,
+            )
+        )
+    return tuple(new)
+
+
+def _shape_of(value: Any) -> Any:
+    """What two parts have in common if they have the same formula of other numbers: the class, and
+    all that is no number; None if that is not known."""
+    if isinstance(value, float):
+        return float
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, tuple):
+        shapes = tuple(map(_shape_of, cast("tuple[Any, ...]", value)))
+        return None if None in shapes else shapes
+    kind = cast("Any", type(value))
+    traits = getattr(value, "traits", None)
+    is_known = kind.__module__.startswith("harnack.") and dataclasses.is_dataclass(value)
+    reads_itself = hasattr(value, "with_attached_numbers")
+    if not is_known or traits is None or reads_itself or not has_own_formula(value):
+        return getattr(value, "alike_key", None)
+    shapes = [kind]
+    literals: tuple[str, ...] = getattr(value, "literals", ())
+    for entry in dataclasses.fields(value):
+        own = getattr(value, entry.name)
+        is_literal = entry.name in literals
+        if is_literal and has_derivatives(kept_arguments(value).get(entry.name)):
+            return None
+        is_number = entry.name in traits.differentiable_arguments or not entry.init
+        is_number &= not is_literal
+        is_fixed = not is_number and (isinstance(own, float) or _is_numbers(own))
+        shape = own if is_fixed else _shape_of(own)
+        if shape is None and own is not None:
+            return None
+        shapes.append(shape)
+    return tuple(shapes)
 
 
 def _has_array(value: Any) -> bool:

@@ -25,12 +25,11 @@ from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
 from harnack.fields.formula_evaluator import as_jet
 from harnack.fields.tape_evaluator import extent_of_long_formula, recorded_tape
 from harnack.fields.vm_formulas import VmFormula
+from harnack.geometry import Volume
 from harnack.name_suggestions import did_you_mean
 
 if TYPE_CHECKING:
     import os
-
-    from harnack.geometry import Volume
 
 _COORDINATES = ("x", "y", "z")
 _CONSTANTS: Mapping[str, float] = MappingProxyType({"pi": math.pi, "e": math.e})
@@ -477,6 +476,13 @@ def expression(
     if parameters is not None and not isinstance(cast("Any", parameters), Mapping):
         raise TypeError(f'parameters are numbers by name, such as {{"a": 2}}, not {parameters!r}')
     values = {**(parameters or {}), **numbers}
+    for name, value in values.items():
+        if isinstance(cast("Any", value), Volume):
+            raise TypeError(
+                f"{name} is a volume and no number of the formula: the volume in which it is drawn "
+                f"is domain={type(value).__name__}(...), and the clip of a picture or trace is an "
+                "argument of that"
+            )
     if isinstance(function, str):
         function = TextFormula.parse(function, values)
     check_no_derivatives("expression", function, domain, level)

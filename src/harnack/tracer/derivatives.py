@@ -106,8 +106,9 @@ class _NoDerivative(dr.CustomOp):
         """Raise NotImplementedError, unless the result is not used."""
         if dr.any(self.grad_out() != 0, axis=None):  # it is zero for a result that is not used
             raise NotImplementedError(
-                f"{self._result_name} of hits cannot be differentiated, only t, position and "
-                "clearance can: detach it where it is used (drjit.detach)"
+                f"{self._result_name} cannot be differentiated here; t, position, normal, value "
+                "and clearance of smooth hits can, and so can distances to smooth points: detach "
+                "it where it is used (drjit.detach)"
             )
 
 
@@ -120,7 +121,30 @@ def refuse_derivative(tracer: SurfaceTracer, o: Vec3, d: Vec3, result_name: str,
     result_name: the name of the result, for the message.
     """
     sources = [o, d, *tracer.levels.values, *differentiable_parameters(tracer.field)]
+    return refuse_derivative_by(sources, f"{result_name} of hits", value)
+
+
+def refuse_derivative_by(sources: list[Any], result_name: str, value: Any) -> Any:
+    """Return the array `value`, as `refuse_derivative` does. sources: the arrays on which it
+    depends."""
     return dr.custom(_NoDerivative, value, result_name, sources)
+
+
+def value_with_derivative(
+    tracer: SurfaceTracer, o: Vec3, d: Vec3, end: MarchResult, value: Real
+) -> Real:
+    """Return the values of f at the ends of rays, with derivatives at hits: those of the level that
+    was hit, since f is that level there whatever rays and parameters are. Those of other rays, and
+    of hits on facets, where f takes no level, are refused.
+
+    tracer, o, d, end: as for `attach_derivatives`. value: f at the ends.
+    """
+    is_known = end.status == int(RayStatus.HIT)
+    if tracer.evaluator.jumps is not None:
+        is_known &= ~end.at_jump
+    change = change_of_nearest_level(tracer.hit_surface(end), dr.detach(value))
+    refused = refuse_derivative(tracer, o, d, "value (but at smooth hits)", value)
+    return dr.select(is_known, value + change, refused)
 
 
 def attach_derivatives(
@@ -333,10 +357,15 @@ def change_of_nearest_level(tracer: SurfaceTracer, f: Real) -> Real:
     tracer: the surface, with its levels.
     f: values of the field's function.
     """
-    nearest, change = dr.inf, tracer.backend.Float(0)
-    for level in tracer.levels.values:
+    return change_of_level(tracer.levels, f)
+
+
+def change_of_level(levels: Levels, f: Real) -> Real:
+    """Return what `change_of_nearest_level` returns, for these levels."""
+    nearest, change = dr.inf, type(f)(0)
+    for level in levels.values:
         with dr.suspend_grad():
-            single = Levels((dr.detach(level),), tracer.levels.period)
+            single = Levels((dr.detach(level),), levels.period)
             gap = single.gaps(f).nearest
             is_nearest = gap < nearest
             nearest = dr.select(is_nearest, gap, nearest)

@@ -31,6 +31,7 @@ from harnack.tracer.derivatives import (
     attach_derivatives,
     needs_derivatives,
     refuse_derivative,
+    value_with_derivative,
 )
 from harnack.tracer.doubtful import Doubtful, seen_distance
 from harnack.tracer.level_contact import HitTolerance, RayStatus
@@ -330,11 +331,9 @@ def hits_with_derivatives(
     has_derivatives = not rays.is_numpy and needs_derivatives(tracer, o, d)
     if has_derivatives:
         t, normal = attach_derivatives(tracer, o, d, end, hits.normal, longest_step=longest_step)
-        # Results without a known derivative raise an error if it is used.
-        value, uncertainty = (
-            refuse_derivative(tracer, o, d, name, array)
-            for name, array in (("value", hits.value), ("uncertainty", hits.uncertainty))
-        )
+        value = value_with_derivative(tracer, o, d, end, hits.value)
+        # It has no known derivative, and raises an error if that is used.
+        uncertainty = refuse_derivative(tracer, o, d, "uncertainty", hits.uncertainty)
         position = _positions(o, d, t)
         hits = replace(
             hits, t=t, position=position, normal=normal, value=value, uncertainty=uncertainty

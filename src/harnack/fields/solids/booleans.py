@@ -23,15 +23,16 @@ from harnack.arithmetic.norms import blend_intersection, blend_union
 from harnack.arithmetic.operators import Tally, tally_of
 from harnack.backend import choose_backend
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import as_finite, as_real, no_derivatives
+from harnack.backend.validation import as_finite, as_real, check_no_derivatives
 from harnack.enclosures import Enclosure, Lipschitz
 from harnack.enclosures.extremum import MaximumEnclosure, MaximumOperand, NegatedEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
-from harnack.fields.attached_numbers import has_own_formula, own_formula
+from harnack.fields.attached_numbers import extreme_of_parts, has_own_formula, own_formula
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, is_checked
 from harnack.fields.formula import on_backend, probe_jets
+from harnack.fields.number_table import is_attached_number
 from harnack.fields.parameters import record_call
 from harnack.fields.solids.solid import (
     EvaluatorOfInner,
@@ -41,6 +42,7 @@ from harnack.fields.solids.solid import (
     by_numbers,
     formula_of,
     not_a_solid,
+    set_frozen,
     without_levels,
 )
 from harnack.fields.tape_evaluator import tape_evaluator
@@ -49,6 +51,7 @@ from harnack.geometry.clip_volumes import box_around_volumes
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 # The value of a combination is known to lie in a range. Bounds from other operands may narrow this
@@ -84,7 +87,6 @@ def intersection(*solids: Solid | Iterable[Solid]) -> Solid:
     return _combination(solids, is_union=False)
 
 
-@no_derivatives
 def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) -> Solid:
     """The union of solids with fillets where their surfaces meet. Of a single solid it is that
     solid.
@@ -103,8 +105,9 @@ def smooth_union(solids: Iterable[Solid], radius: float, *, power: float = 2.0) 
         ValueError: no solids; radius or power out of range.
         TypeError: an entry that is not a solid, or has no formula.
     """
+    is_attached_number((radius, power), "smooth_union")  # raises an error for others
     level: list[Solid] = [*checked_solids(solids)]
-    radius, power = _checked_blend(radius, power)
+    _checked_blend(radius, power)
     while len(level) > 1:
         pairs = [level[k : k + 2] for k in range(0, len(level), 2)]
         level = [
@@ -125,6 +128,8 @@ def checked_solids(solids: Iterable[Any]) -> tuple[Solid, ...]:
     """
     if isinstance(solids, Solid):
         raise TypeError("give the solids as a list of them, such as smooth_union([a, b], radius)")
+    if not isinstance(solids, tuple | list):
+        check_no_derivatives("a combination of solids", solids)
     if isinstance(solids, str | bytes) or not isinstance(solids, Iterable):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(not_a_solid(solids))
     operands = tuple(solids)
@@ -132,6 +137,7 @@ def checked_solids(solids: Iterable[Any]) -> tuple[Solid, ...]:
         raise ValueError("give at least one solid")
     for operand in operands:
         if not isinstance(operand, Solid):
+            check_no_derivatives("a combination of solids", operand)
             raise TypeError(not_a_solid(operand))
     return operands
 
@@ -259,6 +265,21 @@ class BooleanSolid(Solid):
         if len(bounded) < len(extents):
             return None
         return box_around_volumes(bounded)
+
+    def with_read_numbers(self, numbers: NumberReader) -> BooleanSolid:
+        """The copy of the parts with their numbers attached."""
+        other = copy.copy(self)
+        set_frozen(other, "parts", extreme_of_parts(self.parts, numbers, is_least=self.is_union))
+        return other
+
+    @classmethod
+    def of_functions(cls, parts: tuple[Any, ...], *, is_union: bool) -> BooleanSolid:
+        """An object whose formula is the least or greatest of those of the parts, which need be no
+        solids. It is no field that was made by its constructor."""
+        solid = object.__new__(cls)
+        set_frozen(solid, "parts", parts)
+        set_frozen(solid, "is_union", is_union)
+        return solid
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return _extremum(
@@ -686,7 +707,10 @@ def _checked_blend(radius: Any, power: Any) -> tuple[float, float]:
     Raises:
         ValueError: one of them is out of range.
     """
-    radius = as_real(radius, "radius") if dr.is_array_v(type(radius)) else radius
+    radius, power = (
+        as_real(value, name) if dr.is_array_v(type(value)) else value
+        for name, value in (("radius", radius), ("power", power))
+    )
     for name, least, value in (("radius", 0.0, radius), ("power", 1.0, power)):
         is_valid = isinstance(value, numbers.Real) and least <= float(value) < math.inf
         if not is_valid or value == 0:
@@ -711,7 +735,7 @@ class BlendedSolid(FormulaSolid):
     solids grown by the radius.
     """
 
-    traits = dataclasses.replace(by_numbers("parts", "radius"), is_cheap=False)
+    traits = dataclasses.replace(by_numbers("parts", "radius", "power"), is_cheap=False)
     literals = ("power",)  # the ranges of x^p depend on the kind of number that p is
 
     parts: tuple[Solid, Solid]

@@ -7,11 +7,12 @@ are, relative to the distance of the points."""
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 import math
 import numbers
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -19,27 +20,34 @@ import numpy as np
 from harnack.arithmetic import cos, maximum, minimum, sin
 from harnack.arithmetic.operators import tally_of
 from harnack.backend.elementary import fmax, fmin
+from harnack.backend.validation import as_real
 from harnack.enclosures import Lipschitz, Promise
-from harnack.fields.attached_numbers import own_formula
+from harnack.fields.attached_numbers import attached, own_formula
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.formula import probe_jets, with_device_numbers
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction
+from harnack.fields.number_table import is_attached_number, plain_numbers
+from harnack.fields.parameters import Parametrized
 from harnack.fields.solids.solid import (
     AXES,
     FormulaSolid,
     Solid,
     SpaceMap,
     axis_index,
+    by_numbers,
     formula_of,
 )
 from harnack.geometry import Ball, Box
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 
-class Deformation(SpaceMap):
+class Deformation(SpaceMap, Parametrized):
     """A map of space that does not keep lines straight, such as a twist about an axis. It can be
     applied to solids with a formula. The preimage of a point is the point that the map takes to it.
 
@@ -54,6 +62,42 @@ class Deformation(SpaceMap):
         """
         own_formula(solid)(*probe_jets())  # raises TypeError for a solid without a formula
         return DeformedSolid(solid, self)
+
+    @classmethod
+    def of_numbers(cls, **numbers: Any) -> Self:
+        """The map of numbers that may be those of Dr.Jit with derivatives, which are not
+        checked. All others are those that a constructor leaves out."""
+        change = object.__new__(cls)
+        for name, value in numbers.items():
+            object.__setattr__(change, name, value)
+        return change
+
+    def _given(self) -> dict[str, Any]:
+        """The numbers with derivatives that the map was made of, by names."""
+        return vars(self).get("_given_numbers", {})
+
+    def constructor_arguments(self) -> dict[str, Any]:
+        """The arguments of the constructor, in the form in which they were given."""
+        fields = dataclasses.fields(cast("Any", self))
+        stored = {entry.name: getattr(self, entry.name) for entry in fields}
+        return stored | self._given()
+
+    def replace(self, **changes: Any) -> Self:
+        """The map with some of its numbers exchanged."""
+        new = {k: tuple(v.tolist()) if isinstance(v, np.ndarray) else v for k, v in changes.items()}
+        return dataclasses.replace(cast("Any", self), **(self._given() | new))
+
+    def with_read_numbers(self, numbers: NumberReader) -> Deformation:
+        """The copy with the numbers as a reader gives them."""
+        other, given = copy.copy(self), self._given()
+        for entry in dataclasses.fields(cast("Any", self)):
+            plain = getattr(self, entry.name)
+            argument = given.get(entry.name, plain)
+            if isinstance(plain, float):
+                object.__setattr__(other, entry.name, numbers.vector(argument, [plain])[0])
+            elif isinstance(plain, tuple):
+                object.__setattr__(other, entry.name, numbers.vector(argument, cast("Any", plain)))
+        return other
 
     @property
     def min_scale(self) -> float:
@@ -98,8 +142,17 @@ class DeformedSolid(FormulaSolid):
     coordinates along the ray, and of their derivatives, are passed on to the formula.
     """
 
+    traits = by_numbers("inner", "map")
+
     inner: Solid
     map: Deformation
+
+    def with_read_numbers(self, numbers: NumberReader) -> DeformedSolid:
+        """The copy with the attached numbers of the inner solid and of the map."""
+        other = copy.copy(self)
+        object.__setattr__(other, "inner", attached(self.inner, numbers))
+        object.__setattr__(other, "map", self.map.with_read_numbers(numbers))
+        return other
 
     def __post_init__(self) -> None:
         """Set the domain and the smallest wavelength, which follow from those of the inner
@@ -191,6 +244,10 @@ class Twist(Deformation):
 
     def __post_init__(self) -> None:
         axis_index(self.axis)
+        if is_attached_number(self.rate, "a twist"):
+            object.__setattr__(self, "_given_numbers", {"rate": self.rate})
+            rate = as_real(self.rate, "rate, in radians a unit of length,")
+            object.__setattr__(self, "rate", rate)
         if isinstance(self.rate, float) and not math.isfinite(self.rate):
             raise ValueError(f"rate must be finite, in radians a unit of length, not {self.rate!r}")
 
@@ -254,6 +311,11 @@ class Taper(Deformation):
                 or a factor is not positive.
         """
         axis_index(self.axis)
+        pairs = {"start": self.start, "end": self.end}
+        given = {name: end for name, end in pairs.items() if is_attached_number(end, "a taper")}
+        object.__setattr__(self, "_given_numbers", given)
+        for name, value in given.items():
+            object.__setattr__(self, name, tuple(plain_numbers(value).tolist()))
         try:
             ends = (*self.start, *self.end)
         except TypeError:

@@ -7,6 +7,7 @@ of f along a ray."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.arithmetic import Interval, Jet, norm
-from harnack.arithmetic.jet import range_times_length
+from harnack.arithmetic.jet import Dual, range_times_length
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin
@@ -24,6 +25,7 @@ from harnack.backend.validation import as_finite, as_positive
 from harnack.enclosures import Enclosure, LevelGaps, Lipschitz
 from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
+from harnack.fields.attached_numbers import with_attached_arguments
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.formula_evaluator import is_jet
@@ -38,6 +40,7 @@ from harnack.geometry.outline_loops import make_outline
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.number_table import NumberReader, NumberTable
     from harnack.geometry import Volume
 
 # The next ray sample is bounded on a length that is this multiple of the last step
@@ -84,6 +87,10 @@ class Extrusion(Solid):
         ValueError: loops that enclose no area; a height or a taper that is not positive.
     """
 
+    traits = dataclasses.replace(
+        Solid.traits, differentiable_arguments=("height", "twist", "taper")
+    )
+
     loops: Any
     height: float
     twist: float = 0.0
@@ -106,6 +113,14 @@ class Extrusion(Solid):
         set_frozen(self, "_tapering", Taper(*profile) if taper != 1.0 else None)
         # Twist and taper have no Lipschitz constant in all of space.
         set_frozen(self, "lipschitz", 1.0 if self.is_straight else None)
+
+    def with_read_numbers(self, numbers: NumberReader) -> _AttachedExtrusion:
+        """The same function of the numbers with their derivatives."""
+        own = with_attached_arguments(self, ("height", "twist", "taper"), numbers)
+        backend = cast("NumberTable", numbers).backend
+        return _AttachedExtrusion(
+            self._upload(backend).outline, own.height, own.twist, own.taper, self.is_straight
+        )
 
     @property
     def is_straight(self) -> bool:
@@ -178,6 +193,54 @@ class _ExtrusionData:
     half: Real
     twist: Deformation | None
     taper: Deformation | None
+
+
+@dataclass(frozen=True, eq=False)
+class _AttachedExtrusion:
+    """An extrusion whose numbers may have derivatives.
+
+    outline: its edges.
+    height, twist, taper: as of `Extrusion`.
+    is_straight: whether twist and taper are those that change nothing.
+    """
+
+    outline: OutlineEdges
+    height: Any
+    twist: Any
+    taper: Any
+    is_straight: bool
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at coordinates that are Dr.Jit or dual numbers."""
+        is_deformed = not self.is_straight or any(
+            dr.is_array_v(type(v)) and dr.grad_enabled(v) for v in (self.twist, self.taper)
+        )
+        if is_deformed:
+            tapering = Taper.of_numbers(start=(0.0, 1.0), end=(self.height, self.taper), axis="z")
+            rate = self.twist * (math.pi / 180) / self.height
+            x, y, z = tapering.preimage(x, y, z)
+            x, y, z = Twist.of_numbers(rate=rate, axis="z").preimage(x, y, z)
+        half = self.height * 0.5
+        return orthogonal_intersection(self._planar_distance(x, y), abs(z - half) - half)
+
+    def _planar_distance(self, x: Any, y: Any) -> Any:
+        """The signed distance of (x, y) from the outline. It and its gradient are those of a
+        sample, whose derivatives by x and y are known: the second derivative is one across the
+        gradient."""
+        u, v = (w.value if isinstance(w, Dual) else w for w in (x, y))
+        with dr.suspend_grad():
+            side = self.outline.sample(dr.detach(u), dr.detach(v))
+        gx, gy = side.gradient
+        du, dv = u - dr.detach(u), v - dr.detach(v)  # zeros with derivatives
+        value = side.value + gx * du + gy * dv
+        if not isinstance(x, Dual):
+            return value
+        turn = side.second_derivative * (gx * dv - gy * du)
+        a, b = gx - gy * turn, gy + gx * turn
+        slopes = [
+            a * p + b * q for p, q in zip(x.first_derivatives, y.first_derivatives, strict=True)
+        ]
+        return Dual(value, (slopes[0], slopes[1], slopes[2]))
 
 
 @dataclass(frozen=True, eq=False)

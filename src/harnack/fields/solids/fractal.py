@@ -8,6 +8,7 @@ noise."""
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from dataclasses import dataclass
@@ -16,20 +17,22 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 import drjit as dr
 
 from harnack.arithmetic import Interval, Jet
+from harnack.arithmetic.jet import Dual
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_finite, as_integer_in_range, as_positive
 from harnack.enclosures import Lipschitz, TaylorRemainder
-from harnack.fields.attached_numbers import own_formula
+from harnack.fields.attached_numbers import attached, own_formula, with_attached_arguments
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.formula import Formula, with_device_numbers
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction, is_jet
-from harnack.fields.solids.solid import FormulaSolid
+from harnack.fields.solids.solid import FormulaSolid, by_numbers
 from harnack.name_suggestions import is_one_of
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
     from harnack.enclosures import Promise
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 Fade: TypeAlias = Literal["quintic", "cubic"]
@@ -185,6 +188,8 @@ class FractalNoise(FormulaSolid):
     has the fractal dimension 3 - beta. (Hart's equation after 53 has 2 + (3 - beta)/2.)
     """
 
+    traits = by_numbers("beta", "frequency", "amplitude")
+
     octaves: int = 6
     beta: float = 1.0
     frequency: float = 1.0
@@ -206,6 +211,11 @@ class FractalNoise(FormulaSolid):
         for name in ("frequency", "amplitude"):
             value = as_positive(getattr(self, name), f"the {name} of noise")
             object.__setattr__(self, name, value)
+
+    def with_read_numbers(self, numbers: NumberReader) -> _AttachedNoise:
+        """The same function of the numbers with their derivatives."""
+        own = with_attached_arguments(self, ("beta", "frequency", "amplitude"), numbers)
+        return _AttachedNoise(own)
 
     def _sum(self, power: float) -> float:
         """The sum of a_i (2^i k)^power over the octaves i, rounded up; a_i is the amplitude of
@@ -396,6 +406,31 @@ class _NoiseFormula:
 
 
 @dataclass(frozen=True, eq=False)
+class _AttachedNoise:
+    """Noise whose numbers may have derivatives. noise: the noise with these numbers."""
+
+    noise: Any
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at coordinates that are Dr.Jit or dual numbers."""
+        noise, point = self.noise, [v.value if isinstance(v, Dual) else v for v in (x, y, z)]
+        like = next(v for v in point if dr.is_array_v(type(v)))
+        beta: Any = noise.beta
+        fall = dr.exp2(-beta) if dr.is_array_v(type(beta)) else 2.0**-beta
+        seed = dr.uint32_array_t(type(like))(noise.seed)
+        formula = _NoiseFormula(
+            noise.frequency, noise.amplitude, fall, seed, noise.octaves, noise.fade, "noise"
+        )
+        value, gradient, _ = formula._octaves([v + 0 * like for v in point])[0]  # pyright: ignore[reportPrivateUsage]
+        dual = next((v for v in (x, y, z) if isinstance(v, Dual)), None)
+        if dual is None:
+            return value
+        a, b, c = (dual.coerce(v).first_derivatives for v in (x, y, z))
+        slopes = [gradient[0] * a[k] + gradient[1] * b[k] + gradient[2] * c[k] for k in range(3)]
+        return Dual(value, (slopes[0], slopes[1], slopes[2]))
+
+
+@dataclass(frozen=True, eq=False)
 class _NoiseEvaluator(FormulaEvaluator):
     """The evaluator of `FractalNoise`.
 
@@ -447,8 +482,17 @@ class DisplacedSolid(FormulaSolid):
     displaced surface lies where |f| is at most `max_abs` of the noise.
     """
 
+    traits = by_numbers("solid", "noise")
+
     solid: Formula
     noise: FractalNoise
+
+    def with_read_numbers(self, numbers: NumberReader) -> DisplacedSolid:
+        """The copy of which both functions have their numbers attached."""
+        other = copy.copy(self)
+        object.__setattr__(other, "solid", attached(self.solid, numbers))
+        object.__setattr__(other, "noise", self.noise.with_read_numbers(numbers))
+        return other
 
     def __post_init__(self) -> None:
         """Raise TypeError unless the solid has a formula and the noise is `FractalNoise`."""

@@ -8,6 +8,7 @@ above."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from collections.abc import Iterable
@@ -19,7 +20,7 @@ import drjit as dr
 from harnack.arithmetic import Interval, Jet
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin, max_norm, safe_norm
-from harnack.backend.validation import as_finite, no_derivatives
+from harnack.backend.validation import as_finite, check_no_derivatives, has_derivatives
 from harnack.enclosures import Enclosure, LevelGaps
 from harnack.enclosures.samples import Ray, RaySample, Sample, value_error_bound
 from harnack.fields.attached_numbers import has_own_formula, own_formula
@@ -28,6 +29,7 @@ from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Field, check_is_field
 from harnack.fields.formula import Formula, on_backend
 from harnack.fields.formula_evaluator import is_jet
+from harnack.fields.number_table import plain_numbers
 from harnack.fields.solids.booleans import Complement, OffsetSolid, lipschitz_of, negated_sample
 from harnack.fields.solids.mesh_solid import looks_like_mesh, solid_of_mesh
 from harnack.fields.solids.solid import (
@@ -44,7 +46,6 @@ if TYPE_CHECKING:
     from harnack.geometry import Volume
 
 
-@no_derivatives
 def solid(
     field: Any,
     *,
@@ -81,6 +82,8 @@ def solid(
                 "solid(mesh).offset(d) moves its surface by d, and solid(mesh).shell(t) hollows it"
             )
         return solid_of_mesh(field)
+    if not isinstance(field, Formula | Solid):
+        check_no_derivatives("solid", field)
     if len(bounds) != 1:
         _check_is_no_mesh(field)
         raise ValueError("give exactly one of below=, above=, between=, around=")
@@ -93,6 +96,8 @@ def solid(
     # `between` and `around` have two numbers, `below` and `above` one.
     is_band = between is not None or around is not None
     numbers = _levels(bounds[0] if is_band else (bounds[0],), 2 if is_band else 1)
+    given: Any = bounds[0] if is_band else (bounds[0],)
+    is_attached = has_derivatives(given)
     if numbers is None:
         count = ", two of them" if is_band else ""
         raise ValueError(f"levels must be finite numbers{count}, not {bounds[0]!r}")
@@ -104,16 +109,18 @@ def solid(
     # f <= level is an offset of f <= 0; f >= level is the complement.
     sublevel = SublevelSolid(field)
     if below is not None:
-        return OffsetSolid(sublevel, numbers[0])
+        return OffsetSolid(sublevel, given[0])
     if above is not None:
-        return Complement(OffsetSolid(sublevel, numbers[0]))
+        return Complement(OffsetSolid(sublevel, given[0]))
     lower, upper = numbers
     # Here `around` is given: lower is its level, and upper its half width.
     if around is not None:
-        return BandSolid(field, lower, upper)
+        return BandSolid(field, given[0], given[1])
     if not lower < upper:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
-    return BandSolid(field, 0.5 * (lower + upper), 0.5 * (upper - lower))
+    if is_attached:
+        lower, upper = given
+    return BandSolid(field, (lower + upper) * 0.5, (upper - lower) * 0.5)
 
 
 def _check_is_no_mesh(argument: Any) -> None:
@@ -126,10 +133,19 @@ def _check_is_no_mesh(argument: Any) -> None:
 def _levels(levels: Any, count: int) -> tuple[float, ...] | None:
     """The levels as a tuple of floats; None unless they are `count` finite numbers."""
     try:
-        numbers = tuple(float(level) for level in levels)
+        numbers = tuple(plain_numbers(level).item() for level in levels)
+        numbers = tuple(float(number) for number in numbers)
     except (TypeError, ValueError):
+        check_no_derivatives("a solid of a field", levels)
         return None
     return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
+def _check_has_formula_if_attached(solid: SublevelSolid | BandSolid) -> None:
+    """Raise NotImplementedError if a solid is made of a field with derivatives that has no formula
+    through which they pass."""
+    if not isinstance(solid.field, Formula | Solid):
+        check_no_derivatives(type(solid).__name__, solid.field)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +156,12 @@ class SublevelSolid(SolidOfField):
     field: any field.
     """
 
+    traits = dataclasses.replace(SolidOfField.traits, differentiable_arguments=("field",))
+
     field: Field
 
     def __post_init__(self) -> None:
+        _check_has_formula_if_attached(self)
         self._copy_settings()
         domain = None if self.field.traits.is_global else self.field.domain
         object.__setattr__(self, "domain", domain)
@@ -167,7 +186,7 @@ class SublevelSolid(SolidOfField):
         return _SublevelSolidEvaluator(inner, type(self.field).__name__, has_formula)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if isinstance(self.field, Formula) and has_own_formula(self.field):
+        if isinstance(self.field, Formula | Solid) and has_own_formula(self.field):
             return self.field.formula(x, y, z)
         number = x.backend_number() if is_jet(x, type(self.field).__name__) else x
         return self.evaluator(backend_of(number)).formula(x, y, z)
@@ -387,6 +406,10 @@ class BandSolid(SolidOfField):
     (`FoldedEnclosure`).
     """
 
+    traits = dataclasses.replace(
+        SolidOfField.traits, differentiable_arguments=("field", "level", "half_width")
+    )
+
     field: Field
     level: float
     half_width: float
@@ -397,10 +420,15 @@ class BandSolid(SolidOfField):
         Raises:
             ValueError: a number is not finite, or half_width is not positive or too large.
         """
-        as_finite(self.level, "level")
-        if not as_finite(self.half_width, "half_width") > 0:
+        _check_has_formula_if_attached(self)
+        given = self.level, self.half_width
+        object.__setattr__(self, "level", as_finite(self.level, "level"))
+        object.__setattr__(self, "half_width", as_finite(self.half_width, "half_width"))
+        if not self.half_width > 0:
             raise ValueError(f"half_width must be positive, not {self.half_width:g}")
         period = self.field.period
+        if period is not None:
+            check_no_derivatives("a solid around a level of an angle", given)
         if period is not None and not 2 * self.half_width < period:
             raise ValueError(f"half_width must be below {period / 2:g}, half of the period")
         self._copy_settings()
@@ -413,7 +441,7 @@ class BandSolid(SolidOfField):
         return _BandSolidEvaluator(inner, level, half_width, self.field.period)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
-        if not isinstance(self.field, Formula | Solid):
+        if not hasattr(self.field, "formula"):
             return super().formula(x, y, z)
         return abs(own_formula(self.field)(x, y, z) - self.level) - self.half_width
 

@@ -7,6 +7,7 @@ point of the set."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,11 +19,14 @@ from harnack.backend.elementary import clamp, fmax, fmin
 from harnack.backend.validation import as_finite, as_integer_in_range
 from harnack.enclosures import Lipschitz
 from harnack.enclosures.samples import Sample
+from harnack.fields.attached_numbers import with_attached_arguments
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.number_table import detached
 from harnack.fields.solids.solid import Solid, ball_around
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 Quaternion = tuple[float, float, float, float]
@@ -76,6 +80,8 @@ class Julia(Solid):
     So 2^-n g_n times this number is a Lipschitz constant.
     """
 
+    traits = dataclasses.replace(Solid.traits, differentiable_arguments=("c", "fourth_coordinate"))
+
     c: Quaternion = (-0.2, 0.8, 0.0, 0.0)
     iterations: int = 10
     fourth_coordinate: float = 0.0
@@ -88,7 +94,7 @@ class Julia(Solid):
                 is out of range.
         """
         try:
-            numbers = tuple(self.c)
+            numbers = tuple(detached(self.c))
         except TypeError:
             numbers = ()
         if len(numbers) != 4:
@@ -102,6 +108,11 @@ class Julia(Solid):
         object.__setattr__(
             self, "fourth_coordinate", as_finite(self.fourth_coordinate, "the slice of a Julia set")
         )
+
+    def with_read_numbers(self, numbers: NumberReader) -> _AttachedJulia:
+        """The same function of the numbers with their derivatives."""
+        own = with_attached_arguments(self, ("c", "fourth_coordinate"), numbers)
+        return _AttachedJulia(own.c, own.fourth_coordinate, self.iterations)
 
     @property
     def escape_radius(self) -> float:
@@ -138,6 +149,40 @@ class Julia(Solid):
         numbers = self.c, self.fourth_coordinate, math.hypot(*self.c), self.escape_radius
         c, fourth_coordinate, size, radius = _kernel_parameters(backend, numbers)
         return _JuliaEvaluator(c, fourth_coordinate, size, radius, self.iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class _AttachedJulia:
+    """A Julia set whose numbers may have derivatives: c, fourth_coordinate and iterations as of
+    `Julia`. Its function is known for Dr.Jit numbers alone, so that its gradient has no derivatives
+    by c."""
+
+    c: tuple[Any, ...]
+    fourth_coordinate: Any
+    iterations: int
+
+    def formula(self, x: Any, y: Any, z: Any) -> Any:
+        """f at (x, y, z)."""
+        if not all(dr.is_array_v(type(v)) for v in (x, y, z)):
+            raise TypeError("a Julia set has no formula")
+        real = cast("Any", type(x))
+        is_single = dr.type_v(real) == dr.VarType.Float32
+        escape = _ESCAPED_NORM["single" if is_single else "double"]
+        c, q = self.c, [x, y, z, 0 * x + self.fourth_coordinate]
+        factor = 0 * dr.detach(x) + 1
+        for _ in range(self.iterations):
+            is_active = dr.detach(_squared_norm(q)) <= escape * escape
+            across = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+            following = [q[0] * q[0] - across + c[0], *(2 * q[0] * q[i] + c[i] for i in (1, 2, 3))]
+            q = [dr.select(is_active, a, b) for a, b in zip(following, q, strict=True)]
+            factor = dr.select(is_active, 0.5 * factor, factor)
+        # 0 * x turns Python numbers into arrays.
+        bound = 0.5 + dr.sqrt(0.25 + dr.sqrt(_squared_norm([0 * x + part for part in c])))
+        last, length = 2.0**-self.iterations, dr.sqrt(_squared_norm(q))
+        is_floor = dr.detach(length) <= dr.detach(bound) * math.exp(-1.0)
+        return dr.select(
+            is_floor, -last, factor * dr.log(dr.select(is_floor, 1, length)) - last * dr.log(bound)
+        )
 
 
 @dataclass(frozen=True, eq=False)

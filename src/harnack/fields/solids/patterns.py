@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import itertools
 import operator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from harnack.backend.validation import as_finite, as_real_array, check_finite
+from harnack.fields.number_table import NumberSlice, is_attached_number, plain_numbers
 from harnack.fields.solids.booleans import union
 from harnack.fields.solids.solid import axis_index
 from harnack.fields.solids.transforms import AffineMap
@@ -37,7 +38,9 @@ def maps_of(transforms: npt.ArrayLike) -> list[AffineMap]:
         ValueError: another shape, no map, numbers that are not finite, or a singular matrix.
     """
     name = "the transforms of an arrangement"
-    array = np.array(as_real_array(transforms, name), dtype=np.float64)
+    is_attached = is_attached_number(transforms, name)
+    plain: Any = plain_numbers(transforms) if is_attached else transforms
+    array = np.array(as_real_array(plain, name), dtype=np.float64)
     shape = array.shape
     is_vectors = len(shape) == 2 and shape[1] == 3
     is_matrices = len(shape) == 3 and shape[1:] in ((3, 3), (3, 4), (4, 4))
@@ -49,9 +52,18 @@ def maps_of(transforms: npt.ArrayLike) -> list[AffineMap]:
     if not len(array):
         raise ValueError(f"{name} are none: give at least one")
     check_finite(array.reshape(len(array), -1), "transform {}", ValueError, "it must be finite")
-    if is_vectors:
-        return [AffineMap.translation(vector) for vector in array.tolist()]
-    return [AffineMap.of_matrix(matrix) for matrix in array]
+    entries: list[Any] = array.tolist() if is_vectors else list(array)
+    if is_attached:
+        entries = _entries_of(transforms, array)
+    make = AffineMap.translation if is_vectors else AffineMap.of_matrix
+    return [make(entry) for entry in entries]
+
+
+def _entries_of(values: Any, plain: FloatArray) -> list[Any]:
+    """The entries of a list or of a Dr.Jit tensor (n, ...) with derivatives. plain: its values."""
+    if isinstance(values, tuple | list):
+        return [*cast("Any", values)]
+    return [NumberSlice(values, entry, k * entry.size) for k, entry in enumerate(plain)]
 
 
 def translations_of(period: Any, counts: Any) -> list[AffineMap]:
@@ -61,14 +73,20 @@ def translations_of(period: Any, counts: Any) -> list[AffineMap]:
         ValueError: a period of another shape, not finite, or 0 where there are several copies;
             counts that are not positive integers.
     """
-    vectors = _period_vectors(period)
+    is_attached = is_attached_number(period, "the period")
+    vectors = _period_vectors(plain_numbers(period) if is_attached else period)
     numbers = checked_counts(counts)
     for k, (vector, count) in enumerate(zip(vectors, numbers, strict=True)):
         if count > 1 and not vector.any():
             raise ValueError(f"period {k} is 0: {count} copies would be at the same place")
-    steps = itertools.product(*(range(count) for count in numbers))
-    offsets = np.array([*steps], np.float64) @ vectors
-    return [AffineMap.translation(offset) for offset in offsets.tolist()]
+    steps = np.array([*itertools.product(*(range(count) for count in numbers))], np.float64)
+    offsets = (steps @ vectors).tolist()
+    if not is_attached:
+        return [AffineMap.translation(offset) for offset in offsets]
+    return [
+        AffineMap.of_steps(step, period, offset) if any(step) else AffineMap.translation(offset)
+        for step, offset in zip(steps.tolist(), offsets, strict=True)
+    ]
 
 
 def _period_vectors(period: Any) -> FloatArray:
@@ -107,10 +125,14 @@ def checked_counts(counts: Any) -> tuple[int, int, int]:
 def mirror_image(solid: Solid, normal: str | Sequence[float], offset: float) -> Solid:
     """The mirror image of a solid at the plane n . x = offset, where n is the unit vector along
     `normal` (`Solid.mirrored`)."""
-    unit = _unit_vector(normal)
+    is_attached = is_attached_number((normal, offset), "a mirror")
+    plain: Any = plain_numbers(normal) if is_attached and not isinstance(normal, str) else normal
+    unit = _unit_vector(plain)
     distance = as_finite(offset, "the offset of the mirror")
-    matrix = np.eye(3) - 2 * np.outer(unit, unit)
-    return solid.map_operands(AffineMap.of_arrays(matrix, 2 * distance * unit).apply)
+    change = AffineMap.reflection(unit, distance)
+    if is_attached:
+        change = change.with_mirror(unit if isinstance(normal, str) else normal, offset)
+    return solid.map_operands(change.apply)
 
 
 def _unit_vector(normal: str | Sequence[float]) -> FloatArray:

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any
 from harnack.arithmetic import cos, minimum, norm, sin
 from harnack.arithmetic.norms import orthogonal_intersection
 from harnack.backend.validation import as_finite, as_positive, as_triple
+from harnack.fields.attached_numbers import with_attached_arguments
+from harnack.fields.number_table import plain_numbers
+from harnack.fields.parameters import kept_arguments
 from harnack.fields.solids.solid import (
     FormulaSolid,
     Point,
@@ -24,6 +27,7 @@ from harnack.fields.solids.solid import (
 )
 
 if TYPE_CHECKING:
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 
@@ -38,7 +42,7 @@ class Plane(FormulaSolid):
     The gradient of f is n, so that the Lipschitz constant is 1.
     """
 
-    traits = by_numbers("distance")
+    traits = by_numbers("normal", "distance")
 
     is_convex = True
 
@@ -55,7 +59,17 @@ class Plane(FormulaSolid):
         if length == 0.0:
             raise ValueError("the normal of a plane must not be zero")
         set_frozen(self, "normal", tuple(v / length for v in normal))
+        set_frozen(self, "_given_normal", normal)
         set_frozen(self, "distance", as_finite(self.distance, "the distance of a plane"))
+
+    def with_read_numbers(self, numbers: NumberReader) -> Plane:
+        """The copy with the unit vector along the normal that was given, with its derivatives."""
+        other = with_attached_arguments(self, ("distance",), numbers)
+        given: tuple[float, ...] = vars(self)["_given_normal"]
+        normal = numbers.vector(kept_arguments(self).get("normal", given), given)
+        length = norm(*normal)
+        set_frozen(other, "normal", tuple(v / length for v in normal))
+        return other
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         a, b, c = self.normal
@@ -330,7 +344,8 @@ def _checked_powers(powers: Any, name: str) -> tuple[float, float]:
         ValueError: not two numbers, or a power below 1.
     """
     try:
-        p, q = (float(power) for power in powers)
+        p, q = plain_numbers(powers).tolist()
+        p, q = float(p), float(q)
     except (TypeError, ValueError):
         raise ValueError(f"the powers of a {name} must be two numbers, not {powers!r}") from None
     if not (p >= 1.0 and q >= 1.0):
@@ -362,7 +377,7 @@ class Superellipsoid(_Powered):
     other radii it is no larger.
     """
 
-    traits = by_numbers("radii")
+    traits = by_numbers("powers", "radii")
 
     is_convex = True
 
@@ -399,7 +414,7 @@ class Supertorus(_Powered):
     changes no gradient.
     """
 
-    traits = by_numbers("major", "minor")
+    traits = by_numbers("powers", "major", "minor")
 
     powers: tuple[float, float] = (4.0, 4.0)
     major: float = 1.0

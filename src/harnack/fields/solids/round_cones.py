@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from harnack.arithmetic.segments import Frame
-    from harnack.backend import Backend, BoolArray, FloatArray
+    from harnack.backend import BoolArray, FloatArray
+    from harnack.fields.number_table import NumberReader
     from harnack.geometry import Volume
 
 
@@ -112,10 +113,10 @@ class Capsule(FormulaSolid):
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         return segment_distance((x, y, z), self._frame, self._half_length) - self.radius
 
-    def with_attached_numbers(self, backend: Backend) -> _PlainCone:
+    def with_read_numbers(self, numbers: NumberReader) -> PlainCone:
         """The same function of the numbers with their derivatives."""
-        numbers = with_attached_arguments(self, ("start", "end", "radius"), backend)
-        return _PlainCone((numbers.start, numbers.end), (numbers.radius, numbers.radius))
+        own = with_attached_arguments(self, ("start", "end", "radius"), numbers)
+        return PlainCone((own.start, own.end), (own.radius, own.radius))
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box of the segment, grown by radius
@@ -199,13 +200,13 @@ class RoundCone(FormulaSolid):
             return norm(x, y, z) - radius
         return cone_distance((x, y, z), self._frame, length, slope, ratio) - radius
 
-    def with_attached_numbers(self, backend: Backend) -> _PlainCone:
+    def with_read_numbers(self, numbers: NumberReader) -> PlainCone:
         """The same function of the numbers with their derivatives."""
-        numbers = with_attached_arguments(self, ("start", "end", "radii"), backend)
-        ends, radii = (numbers.start, numbers.end), numbers.radii
+        own = with_attached_arguments(self, ("start", "end", "radii"), numbers)
+        ends, radii = (own.start, own.end), own.radii
         if self.radii[1] > self.radii[0]:
             ends, radii = ends[::-1], radii[::-1]
-        return _PlainCone(ends, radii, self._is_ball)
+        return PlainCone(ends, radii, self._is_ball)
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
         """A box that contains all points where f <= level: the box around both balls, each with
@@ -218,7 +219,7 @@ class RoundCone(FormulaSolid):
 
 
 @dataclass(frozen=True)
-class _PlainCone:
+class PlainCone:
     """The function of a round cone or capsule, computed from its numbers, which may be those of
     Dr.Jit with derivatives.
 
@@ -230,6 +231,18 @@ class _PlainCone:
     ends: tuple[tuple[Any, ...], ...]
     radii: tuple[Any, Any]
     is_ball: bool = False
+
+    @classmethod
+    def read(cls, is_ball: bool, numbers: NumberReader) -> PlainCone:
+        """The cone whose eight numbers a reader gives: both centers and both radii."""
+        a = numbers.vector(None, (0.0,) * 8)
+        return cls((a[:3], a[3:6]), (a[6], a[7]), is_ball)
+
+    @classmethod
+    def read_capsule(cls, numbers: NumberReader) -> PlainCone:
+        """The capsule whose seven numbers a reader gives: both ends and the radius."""
+        a = numbers.vector(None, (0.0,) * 7)
+        return cls((a[:3], a[3:6]), (a[6], a[6]))
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         """f at (x, y, z)."""

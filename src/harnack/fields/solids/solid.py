@@ -10,15 +10,19 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
+import numbers
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
-from harnack.backend.validation import as_positive, no_derivatives
+import drjit as dr
+
+from harnack.backend.validation import as_positive
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import Evaluator, Plan
 from harnack.fields.field import Field, Traits
 from harnack.fields.formula import Formula
 from harnack.fields.formula_evaluator import FormulaFunction
+from harnack.fields.number_table import is_attached_number
 from harnack.geometry import Ball, Box, Volume
 from harnack.name_suggestions import with_article
 
@@ -98,7 +102,12 @@ def not_a_solid(other: Any) -> str:
             f"{kind} is a field and no solid: make one of it by harnack.solid(field, below=level), "
             "above=level or between=(low, high); blobs are solid above 1, formulas mostly below 0"
         )
-    return f"only solids, such as harnack.Sphere(1.0), are combined, not {kind}"
+    message = f"only solids, such as harnack.Sphere(1.0), are combined, not {kind}"
+    if callable(getattr(other, "struts", None)):
+        message += ": make one of it by .struts(radius)"
+    elif isinstance(other, numbers.Real) or dr.is_array_v(cast("Any", type(other))):
+        message += "; a solid grows by offset(distance), and shrinks by a negative one"
+    return message
 
 
 class Solid(Field):
@@ -242,7 +251,6 @@ class Solid(Field):
 
         return OffsetSolid(self, distance)
 
-    @no_derivatives
     def shell(self, thickness: float) -> Solid:
         """The hollow solid of the points where -thickness <= f <= 0. If f is a distance, as for a
         mesh, a sphere or an outline, this is a wall of that thickness inside of the surface.
@@ -252,7 +260,9 @@ class Solid(Field):
         """
         from harnack.fields.solids.from_field import BandSolid
 
-        half = 0.5 * as_positive(thickness, "the thickness of a shell")
+        is_attached_number(thickness, "the thickness of a shell")  # raises an error for others
+        as_positive(thickness, "the thickness of a shell")
+        half = thickness * 0.5
         return BandSolid(self, -half, half)
 
     # Maps of space. Maps that do not keep lines straight need a formula.
@@ -285,7 +295,6 @@ class Solid(Field):
 
         return self._apply_map(AffineMap.scaling(factors))
 
-    @no_derivatives
     def transformed(self, matrix: npt.ArrayLike) -> Solid:
         """The image of the solid under a linear or an affine map.
 
@@ -295,15 +304,14 @@ class Solid(Field):
 
         return self._apply_map(AffineMap.of_matrix(matrix))
 
-    @no_derivatives
     def twisted(self, rate: float, axis: str = "z") -> Solid:
         """The solid, twisted about a coordinate axis: each cross section is rotated by `rate`
         degrees for each unit of length along the axis."""
         from harnack.fields.solids.deformations import Twist
 
-        return self._apply_map(Twist(math.radians(rate), axis))
+        is_attached_number(rate, "the rate of a twist")  # raises an error for others
+        return self._apply_map(Twist(rate * (math.pi / 180), axis))
 
-    @no_derivatives
     def tapered(
         self, start: tuple[float, float], end: tuple[float, float], axis: str = "z"
     ) -> Solid:
@@ -320,7 +328,6 @@ class Solid(Field):
 
     # Patterns: unions of copies.
 
-    @no_derivatives
     def arranged(self, transforms: npt.ArrayLike) -> Solid:
         """The union of copies of the solid at given places. Copies may overlap.
 
@@ -335,7 +342,6 @@ class Solid(Field):
 
         return union_of_images(self, maps_of(transforms))
 
-    @no_derivatives
     def repeated(self, period: npt.ArrayLike, counts: int | Sequence[int]) -> Solid:
         """The union of copies of the solid in a row, a plane or a block: the solid itself, and
         copies moved by i a + j b + k c for 0 <= i, j, k below the counts. Copies may overlap.
@@ -353,7 +359,6 @@ class Solid(Field):
 
         return union_of_images(self, translations_of(period, counts))
 
-    @no_derivatives
     def mirrored(self, normal: str | Sequence[float] = "x", offset: float = 0.0) -> Solid:
         """The union of the solid and its mirror image. (The mirror image alone is
         transformed(matrix) with the matrix of a reflection.)
@@ -369,7 +374,6 @@ class Solid(Field):
 
         return union(self, mirror_image(self, normal, offset))
 
-    @no_derivatives
     def around(self, count: int, axis: str | Sequence[float] = "z") -> Solid:
         """The union of copies of the solid at equal angles around an axis through the origin: the
         solid itself, and copies rotated by multiples of 360/count degrees.

@@ -12,11 +12,19 @@ import numpy as np
 from harnack.arithmetic import cone_distance, minimum, segment_distance
 from harnack.arithmetic.operators import FormulaNumber, Tally, tally_of
 from harnack.backend import BoolArray, FloatArray, IntArray
-from harnack.backend.validation import no_derivatives
+from harnack.backend.validation import check_no_derivatives
 from harnack.fields.evaluator import POINTS, Plan
-from harnack.fields.solids.booleans import smooth_union
-from harnack.fields.solids.round_cones import Capsule, RoundCone, axial_frames, cone_numbers
-from harnack.fields.solids.solid import FormulaSolid, box_around, set_frozen
+from harnack.fields.number_table import AlikeParts, NumberTable, detached, plain_numbers
+from harnack.fields.parameters import kept_arguments
+from harnack.fields.solids.booleans import BooleanSolid, smooth_union
+from harnack.fields.solids.round_cones import (
+    Capsule,
+    PlainCone,
+    RoundCone,
+    axial_frames,
+    cone_numbers,
+)
+from harnack.fields.solids.solid import FormulaSolid, box_around, by_numbers, set_frozen
 from harnack.fields.solids.tube import checked_pairs, checked_points, checked_radii
 from harnack.fields.tape_evaluator import tape_evaluator
 
@@ -27,6 +35,7 @@ if TYPE_CHECKING:
 
     from harnack.backend import Backend
     from harnack.fields.formula_evaluator import FormulaEvaluator
+    from harnack.fields.number_table import NumberReader
     from harnack.fields.solids.solid import Solid
     from harnack.geometry import Volume
 
@@ -46,13 +55,15 @@ class Struts(FormulaSolid):
     edges: IntArray
     radii: FloatArray
 
+    traits = by_numbers("nodes", "radii")
+
     lipschitz = Capsule.lipschitz
 
     def __post_init__(self) -> None:
         """Check the arrays, and make them read-only."""
-        nodes = checked_points(self.nodes, ("node", "struts"))
+        nodes = checked_points(detached(self.nodes), ("node", "struts"))
         edges = checked_pairs(self.edges, nodes, ("edge", "node", "struts"))
-        radii = checked_radii(self.radii, len(nodes), ("node", "struts"))
+        radii = checked_radii(detached(self.radii), len(nodes), ("node", "struts"))
         for name, entries in (("nodes", nodes), ("edges", edges), ("radii", radii)):
             entries.setflags(write=False)
             set_frozen(self, name, entries)
@@ -69,6 +80,31 @@ class Struts(FormulaSolid):
             for part in parts
         ]
         return cls(nodes, np.arange(2 * len(parts)).reshape(-1, 2), np.array(radii).ravel())
+
+    def with_read_numbers(self, numbers: NumberReader) -> BooleanSolid:
+        """The same function of the nodes and radii with their derivatives."""
+        if not isinstance(numbers, NumberTable):
+            raise TypeError("the numbers of struts are read from a table")
+        kept, radii = kept_arguments(self), self.radii[self.edges]
+        ends = np.where((radii[:, 1] > radii[:, 0])[:, None], self.edges[:, ::-1], self.edges)
+        node_places = numbers.places(kept.get("nodes"), self.nodes.size).reshape(-1, 3)
+        own_radii = kept.get("radii")
+        is_single = own_radii is not None and plain_numbers(own_radii).size == 1
+        radius_places = numbers.places(own_radii, 1 if is_single else len(self.radii))
+        radius_places = np.broadcast_to(radius_places, len(self.radii))
+        values = np.hstack([self.nodes[ends].reshape(-1, 6), self.radii[ends]])
+        places = np.hstack([node_places[ends].reshape(-1, 6), radius_places[ends]])
+        length = np.linalg.norm(values[:, 3:6] - values[:, :3], axis=1)
+        is_nested = cone_numbers(length, values[:, 6:])[0]
+        parts: list[Any] = []
+        for is_ball in (False, True):
+            chosen = is_nested == is_ball
+            make = functools.partial(PlainCone.read, is_ball)
+            if chosen.any():
+                parts.append(
+                    AlikeParts(numbers, values[chosen], places[chosen], make, is_least=True)
+                )
+        return BooleanSolid.of_functions(tuple(parts), is_union=True)
 
     def strut(self, number: int) -> Capsule | RoundCone:
         """The strut of the edge with this number."""
@@ -154,7 +190,6 @@ class Struts(FormulaSolid):
         return box_around((half[0], half[1], half[2]), center)
 
 
-@no_derivatives
 def struts(
     nodes: npt.ArrayLike,
     edges: npt.ArrayLike,
@@ -180,4 +215,5 @@ def struts(
     graph = Struts(nodes, edges, radius)  # type: ignore[arg-type]
     if smooth is None:
         return graph
+    check_no_derivatives("struts with fillets", nodes, radius)
     return smooth_union([graph.strut(k) for k in range(len(graph.edges))], smooth)

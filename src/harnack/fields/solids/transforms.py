@@ -18,19 +18,17 @@ import drjit as dr
 import numpy as np
 import numpy.typing as npt
 
-from harnack.arithmetic import Jet
+from harnack.arithmetic import Jet, cos, norm, sin
 from harnack.backend.elementary import max_norm, safe_norm
 from harnack.backend.validation import (
-    as_positive,
     as_real,
     as_triple,
     check_no_derivatives,
-    has_derivatives,
 )
 from harnack.enclosures import Promise
 from harnack.enclosures.extremum import ScaledEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
-from harnack.fields.attached_numbers import attached, attached_vector, own_formula
+from harnack.fields.attached_numbers import attached, own_formula
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.formula import with_device_numbers
 from harnack.fields.formula_evaluator import (
@@ -38,6 +36,13 @@ from harnack.fields.formula_evaluator import (
     FormulaFunction,
     as_jet,
     hessian_error,
+)
+from harnack.fields.number_table import (
+    NumberReader,
+    NumberTable,
+    detached,
+    is_attached_number,
+    plain_numbers,
 )
 from harnack.fields.parameters import Parametrized
 from harnack.fields.solids.solid import (
@@ -109,6 +114,9 @@ class AffineMap(SpaceMap, Parametrized):
         Raises:
             ValueError: as `of_arrays`, or another last row.
         """
+        if is_attached_number(matrix, "a map of space"):
+            own = _AttachedNumbers({"of": matrix}, _inverse_of_matrix)
+            return replace(cls.of_matrix(own.values["of"]), attached=own)
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape == (4, 4):
             if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
@@ -121,12 +129,31 @@ class AffineMap(SpaceMap, Parametrized):
     @classmethod
     def translation(cls, offset: Sequence[float]) -> AffineMap:
         """The translation u -> u + offset."""
-        if _is_attached(offset, "an offset"):
-            plain = cls.of_arrays(np.eye(3), as_triple(offset, "offset"))
-            return replace(plain, attached=_AttachedNumbers("offset", offset, _inverse_translation))
+        if is_attached_number(offset, "an offset"):
+            plain = cls.of_arrays(np.eye(3), as_triple(detached(offset), "offset"))
+            return replace(
+                plain, attached=_AttachedNumbers({"moved": offset}, _inverse_translation)
+            )
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
+
+    @classmethod
+    def of_steps(cls, steps: Sequence[float], period: Any, offset: Sequence[float]) -> AffineMap:
+        """The translation by `offset`, so many steps of a period with derivatives along each of its
+        vectors (`Solid.repeated`)."""
+        own = _AttachedNumbers({"period": period}, functools.partial(_inverse_of_steps, steps))
+        return replace(cls.of_arrays(np.eye(3), offset), attached=own)
+
+    @classmethod
+    def reflection(cls, unit: FloatArray, distance: float) -> AffineMap:
+        """The reflection at the plane n . x = distance with the unit vector n."""
+        return cls.of_arrays(np.eye(3) - 2 * np.outer(unit, unit), 2 * distance * unit)
+
+    def with_mirror(self, normal: Any, offset: Any) -> AffineMap:
+        """This reflection with numbers that have derivatives. normal: (3,) of any length."""
+        own = _AttachedNumbers({"normal": normal, "mirror": offset}, _inverse_reflection)
+        return replace(self, attached=own)
 
     @classmethod
     def rotation(cls, degrees: float, axis: str | Sequence[float]) -> AffineMap:
@@ -135,36 +162,33 @@ class AffineMap(SpaceMap, Parametrized):
 
         axis: "x", "y", "z" or a vector (3,).
         """
-        check_no_derivatives("the axis of a rotation", axis)
-        if isinstance(axis, str):
-            unit = np.eye(3)[axis_index(axis)]
-        else:
-            unit = np.asarray(axis, dtype=np.float64)
-            length = np.linalg.norm(unit) if unit.shape == (3,) else 0.0
-            if not (np.isfinite(length) and length > 0):
-                raise ValueError(
-                    "axis must be a vector (3,) that is not zero, or one of x, y, z, not "
-                    f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
-                )
-            unit = unit / length
+        is_attached = is_attached_number((degrees, axis), "a rotation")
+        is_name = isinstance(axis, str)
+        vector = np.eye(3)[axis_index(axis)] if is_name else plain_numbers(axis)
+        length = np.linalg.norm(vector) if vector.shape == (3,) else 0.0
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(
+                "axis must be a vector (3,) that is not zero, or one of x, y, z, not "
+                f'{axis!r}: write rotated(degrees, axis), such as rotated(30, "x")'
+            )
         # Rodrigues' formula: I + sin(angle) k + (1 - cos(angle)) k^2, with k the matrix of the
         # cross product with the axis.
-        angle = math.radians(as_real(degrees, "the angle of a rotation"))
-        k = np.cross(np.eye(3), unit)  # k v = unit x v
+        plain_degrees = as_real(degrees, "the angle of a rotation")
+        angle = math.radians(plain_degrees)
+        k = np.cross(np.eye(3), vector / length)  # k v = unit x v
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
-        if _is_attached(degrees, "the angle of a rotation"):
-            inverse = functools.partial(_inverse_rotation, k)
-            attached_angle = _AttachedNumbers("degrees", degrees, inverse)
-            return replace(cls.of_arrays(turn), attached=attached_angle)
-        return cls.of_arrays(turn)
+        if not is_attached:
+            return cls.of_arrays(turn)
+        given = {"degrees": degrees, "axis": vector if is_name else axis}
+        own = _AttachedNumbers(given, _inverse_rotation)
+        return replace(cls.of_arrays(turn), attached=own)
 
     @classmethod
     def scaling(cls, factors: float | Sequence[float]) -> AffineMap:
         """The scaling u -> factors u, by one positive factor, or by one for each axis."""
-        if _is_attached(factors, "a scaling by several factors", is_vector=False):
-            factor = as_positive(factors, "a factor with derivatives, of all axes,")
-            attached_factor = _AttachedNumbers("factors", factors, _inverse_scaling)
-            return replace(cls.of_arrays(factor * np.eye(3)), attached=attached_factor)
+        if is_attached_number(factors, "a scaling"):
+            own = _AttachedNumbers({"scaled": factors}, _inverse_scaling)
+            return replace(cls.scaling(cast("Any", np.squeeze(own.values["scaled"]))), attached=own)
         sizes = np.asarray(factors, dtype=np.float64)
         # Any other shape becomes NaN, which is refused below.
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
@@ -176,7 +200,18 @@ class AffineMap(SpaceMap, Parametrized):
         """The arguments of `of_arrays`."""
         arguments: dict[str, Any] = {"matrix": self.matrix, "offset": self.translation_vector}
         own = self.attached
-        return arguments if own is None else {**arguments, own.name: own.value}
+        return arguments if own is None else {**arguments, **own.arguments}
+
+    @property
+    def alike_key(self) -> tuple[Any, ...] | None:
+        """What maps have in common that are computed alike of their numbers; None for those that
+        are computed in another way than all others."""
+        own = self.attached
+        if own is None:
+            return ("affine",)
+        if isinstance(own.inverse, functools.partial):
+            return None
+        return (own.inverse, *own.arguments, *map(np.shape, own.values.values()))
 
     def replace(self, **changes: Any) -> AffineMap:
         """The map of another matrix or offset, by `of_arrays`. The factor of values changes as that
@@ -205,7 +240,9 @@ class AffineMap(SpaceMap, Parametrized):
     def is_identity(self) -> bool:
         """Whether the map leaves all points where they are."""
         identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-        return self.matrix == identity and not any(self.translation_vector)
+        return (
+            self.attached is None and self.matrix == identity and not any(self.translation_vector)
+        )
 
     @property
     def inverse(self) -> FloatArray:
@@ -301,15 +338,16 @@ class TransformedSolid(SolidOfField):
             traits = dataclasses.replace(self.traits, min_wavelength=wavelength / numbers.stretch)
             object.__setattr__(self, "traits", traits)
 
-    def with_attached_numbers(self, backend: Backend) -> TransformedSolid:
+    def with_read_numbers(self, numbers: NumberReader) -> TransformedSolid:
         """The copy whose formula has the attached numbers of the inner solid and of the map."""
         other = copy.copy(self)
-        object.__setattr__(other, "field", attached(self.field, backend))
-        own = self.map.attached
+        object.__setattr__(other, "field", attached(self.field, numbers))
+        own, plain = self.map.attached, self.inverse_map
         if own is not None:
-            object.__setattr__(
-                other, "inverse_map", own.inverse(self.inverse_map, own.value, backend)
-            )
+            plain = own.inverse(plain, own, numbers)
+        elif not isinstance(numbers, NumberTable):
+            plain = plain.read_by(numbers)
+        object.__setattr__(other, "inverse_map", plain)
         return other
 
     def sublevel_extent(self, level: float = 0.0, *, above: bool = False) -> Volume | None:
@@ -329,58 +367,115 @@ class TransformedSolid(SolidOfField):
 
 @dataclass(frozen=True, eq=False)
 class _AttachedNumbers:
-    """Numbers with derivatives that an affine map was made of.
+    """Numbers that an affine map was made of, some of which have derivatives.
 
-    name, value: what they are, and the numbers.
-    inverse: makes the inverse map of them on a backend, from that without derivatives.
+    arguments: the numbers, by names.
+    inverse: makes the inverse map of them, from that without derivatives.
+    values: the numbers without derivatives.
     """
 
-    name: str
-    value: Any
-    inverse: Callable[[_InverseMap, Any, Backend], _InverseMap]
+    arguments: dict[str, Any]
+    inverse: Callable[[_InverseMap, _AttachedNumbers, NumberReader], _InverseMap]
+    values: dict[str, FloatArray] = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        values = {name: plain_numbers(value) for name, value in self.arguments.items()}
+        object.__setattr__(self, "values", values)
+
+    def read(self, name: str, numbers: NumberReader) -> tuple[Any, ...]:
+        """The numbers of an argument, as a reader gives them."""
+        return numbers.vector(self.arguments[name], self.values[name].ravel().tolist())
 
 
-def _is_attached(value: Any, name: str, *, is_vector: bool = True) -> bool:
-    """Whether a number or vector is one of Dr.Jit with derivatives. Raises NotImplementedError for
-    other values that carry derivatives. is_vector: whether it may be a tuple or list."""
-    if not has_derivatives(value):
-        return False
-    is_sequence = is_vector and isinstance(value, tuple | list)
-    entries: list[Any] = list(cast("Any", value)) if is_sequence else [value]
-    others = [e for e in entries if not dr.is_array_v(cast("Any", type(e)))]
-    check_no_derivatives(name, others)
-    return True
-
-
-def _inverse_translation(plain: _InverseMap, offset: Any, backend: Backend) -> _InverseMap:
-    return replace(
-        plain, translation_vector=attached_vector(offset, plain.translation_vector, backend)
-    )
+def _inverse_translation(
+    plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
+) -> _InverseMap:
+    return replace(plain, translation_vector=own.read("moved", numbers))
 
 
 def _inverse_rotation(
-    k: FloatArray, plain: _InverseMap, degrees: Any, backend: Backend
+    plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
 ) -> _InverseMap:
-    """The inverse of a rotation: I - sin(angle) k + (1 - cos(angle)) k^2.
-
-    k: the matrix of the cross product with the axis.
-    """
-    plain_angle = as_real(degrees, "the angle of a rotation")
-    angle = attached_vector(degrees, [plain_angle], backend)[0] * (math.pi / 180)
-    sine, versine, square = dr.sin(angle), 1 - dr.cos(angle), k @ k
+    """The inverse of a rotation: I - sin(angle) k + (1 - cos(angle)) k^2, where k is the matrix of
+    the cross product with the unit vector u along the axis, and k^2 = u u^T - I."""
+    angle = own.read("degrees", numbers)[0] * (math.pi / 180)
+    vector = own.read("axis", numbers)
+    length = norm(*vector)
+    u = [component / length for component in vector]
+    sine, versine = sin(angle), 1 - cos(angle)
+    cross = ((0.0, -u[2], u[1]), (u[2], 0.0, -u[0]), (-u[1], u[0], 0.0))
     rows = tuple(
         tuple(
-            versine * float(square[i, j]) - sine * float(k[i, j]) + float(i == j) for j in range(3)
+            (u[i] * u[j] - float(i == j)) * versine - cross[i][j] * sine + float(i == j)
+            for j in range(3)
         )
         for i in range(3)
     )
     return replace(plain, rows=rows)
 
 
-def _inverse_scaling(plain: _InverseMap, factor: Any, backend: Backend) -> _InverseMap:
-    size = attached_vector(factor, [plain.factor], backend)[0]
-    rows = tuple(tuple(1 / size if i == j else 0.0 for j in range(3)) for i in range(3))
-    return replace(plain, rows=rows, factor=size)
+def _inverse_of_steps(
+    steps: Sequence[float], plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
+) -> _InverseMap:
+    """The inverse of a translation by `steps` of a period: a length for all axes, one for each, or
+    three vectors."""
+    period = own.read("period", numbers)
+    if len(period) < 9:
+        lengths = period * 3 if len(period) == 1 else period
+        vector = tuple(a * s if s else 0.0 for a, s in zip(lengths, steps, strict=True))
+    else:
+        vector = tuple(_dot([period[3 * i + k] for i in range(3)], steps) for k in range(3))
+    return replace(plain, translation_vector=vector)
+
+
+def _inverse_reflection(
+    plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
+) -> _InverseMap:
+    """The inverse of a reflection, which is the reflection itself."""
+    normal = own.read("normal", numbers)
+    length = norm(*normal)
+    u = [component / length for component in normal]
+    distance = own.read("mirror", numbers)[0]
+    rows = tuple(tuple(u[i] * u[j] * -2.0 + float(i == j) for j in range(3)) for i in range(3))
+    return replace(plain, rows=rows, translation_vector=tuple(2.0 * distance * n for n in u))
+
+
+def _inverse_scaling(
+    plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
+) -> _InverseMap:
+    """The inverse of a scaling. With a factor for each axis, the factor of the function is
+    constant: 1 or, where all three are equal, that number."""
+    scales = own.read("scaled", numbers)
+    factor = scales[0] if len(scales) == 1 else plain.factor
+    scales = scales * 3 if len(scales) == 1 else scales
+    rows = tuple(tuple(1 / scales[i] if i == j else 0.0 for j in range(3)) for i in range(3))
+    return replace(plain, rows=rows, factor=factor)
+
+
+def _inverse_of_matrix(
+    plain: _InverseMap, own: _AttachedNumbers, numbers: NumberReader
+) -> _InverseMap:
+    """The inverse of a map by its matrix (3, 3), (3, 4) or (4, 4), with Cramer's rule. The factor
+    of the function is constant."""
+    entries, step = own.read("of", numbers), own.values["of"].shape[1]
+    m = [entries[step * k : step * k + step] for k in range(3)]
+    # The columns of the inverse are the cross products of rows over the determinant.
+    columns = [_cross(m[(k + 1) % 3], m[(k + 2) % 3]) for k in range(3)]
+    determinant = _dot(m[0], columns[0])
+    rows = tuple(tuple(columns[j][i] / determinant for j in range(3)) for i in range(3))
+    vector = tuple(row[3] for row in m) if step == 4 else plain.translation_vector
+    return replace(plain, rows=rows, translation_vector=vector)
+
+
+def _cross(a: Sequence[Any], b: Sequence[Any]) -> tuple[Any, Any, Any]:
+    """The cross product of two vectors."""
+    x, y, z = (a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3] for i in range(3))
+    return x, y, z
+
+
+def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+    """The scalar product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _formula_of_image(
@@ -579,6 +674,13 @@ class _InverseMap:
             )
         )
         return replace(parameters, rows=rows[:3], translation_vector=rows[3])
+
+    def read_by(self, numbers: NumberReader) -> _InverseMap:
+        """The same map with its numbers as a reader gives them."""
+        rows = tuple(numbers.vector(None, row) for row in self.rows)
+        vector = numbers.vector(None, self.translation_vector)
+        factor = numbers.vector(None, [self.factor])[0]
+        return replace(self, rows=rows, translation_vector=vector, factor=factor)
 
     def local(self, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
         """The three coordinates of M^-1 (p - b), the preimage of the point p = (x, y, z).

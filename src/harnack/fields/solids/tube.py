@@ -8,6 +8,7 @@ numbers that it changes from one segment to the next."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -34,13 +35,17 @@ from harnack.enclosures.piecewise_taylor import PiecewiseTaylorEnclosure
 from harnack.enclosures.samples import Ray, RaySample, Sample
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
+from harnack.fields.number_table import AlikeParts, detached, plain_numbers
+from harnack.fields.parameters import kept_arguments
 from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
+from harnack.fields.solids.round_cones import PlainCone
 from harnack.fields.solids.solid import Solid, box_around
 from harnack.geometry.beziers import flatten_bezier
 from harnack.tree.closest_triangles import MAX_BOXES
 
 if TYPE_CHECKING:
     from harnack.backend import Backend, Real, Vec3
+    from harnack.fields.number_table import NumberReader, NumberTable
     from harnack.geometry import Volume
 
 __all__ = ["TubeNetwork"]
@@ -74,6 +79,8 @@ class Tube(Solid):
     ray a stronger bound is proved: see `TangentEnclosure`.
     """
 
+    traits = dataclasses.replace(Solid.traits, differentiable_arguments=("points", "radius"))
+
     points: FloatArray
     radius: float
     starts: tuple[int, ...] = field(default=(), kw_only=True)
@@ -88,26 +95,30 @@ class Tube(Solid):
             ValueError, TypeError: arguments of another kind, or a polyline of fewer than two
                 different points.
         """
-        array = as_real_array(self.points, "the points of a tube")
+        array = as_real_array(detached(self.points), "the points of a tube")
         check_vectors(array, "the points of a tube")
         points = np.array(array, dtype=np.float64)
         check_finite(points, "point {} of a tube", ValueError)
         check_coordinate_size(points, ValueError)
         parts: list[FloatArray] = []
+        indices: list[IntArray] = []
         if not isinstance(cast("Any", self.starts), tuple | list | np.ndarray):
             raise TypeError(f"starts must be indices of vertices, not {self.starts!r:.60}")
         starts = [as_integer_in_range(start, "each start", 0, len(points)) for start in self.starts]
         if not 0 <= as_real(self.flattening_error, "flattening_error") < math.inf:
             raise ValueError(f"flattening_error must be a length, not {self.flattening_error!r}")
         # Split at the starts of polylines, and leave out repeated points of each polyline.
-        for part in np.split(points, starts):
+        numbered = np.split(np.arange(len(points)), starts)
+        for part, own in zip(np.split(points, starts), numbered, strict=True):
             if len(part):
                 # For each point but the first, whether it differs from the point before.
-                differs = np.any(part[1:] != part[:-1], axis=1)
-                part = part[np.concatenate([[True], differs])]
+                differs = np.concatenate([[True], np.any(part[1:] != part[:-1], axis=1)])
+                part, own = part[differs], own[differs]
             if len(part) < 2:
                 raise ValueError("a tube needs two points or more that differ: use Sphere for one")
             parts.append(part)
+            indices.append(own)
+        object.__setattr__(self, "_given_indices", np.concatenate(indices))
         points = np.concatenate(parts)
         # The indices at which polylines start, after points were left out.
         ends = np.cumsum([len(part) for part in parts])[:-1]
@@ -212,6 +223,34 @@ class Tube(Solid):
         error = radius * (angle / math.ceil(count)) ** 2 / 8.0
         return cls(points, wire, flattening_error=error)
 
+    def with_read_numbers(self, numbers: NumberReader) -> AlikeParts:
+        """The same function of the points and the radius with their derivatives."""
+        table, kept = cast("NumberTable", numbers), kept_arguments(self)
+        given = vars(self)["_given_indices"]
+        points = kept.get("points")
+        count = len(given) if points is None else plain_numbers(points).shape[0]
+        places = table.places(points, 3 * count).reshape(-1, 3)[
+            given if points is not None else ...
+        ]
+        start = self._segment_starts()
+        ends = np.stack([start, start + 1], axis=1)
+        radius = np.full((len(start), 1), self.radius)
+        radius_place = np.tile(table.places(kept.get("radius"), 1), (len(start), 1))
+        return AlikeParts(
+            table,
+            np.hstack([self.points[ends].reshape(-1, 6), radius]),
+            np.hstack([places[ends].reshape(-1, 6), radius_place]),
+            PlainCone.read_capsule,
+            is_least=True,
+        )
+
+    def _segment_starts(self) -> IntArray:
+        """The indices of the points at which segments begin."""
+        is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
+        # The last vertex of a polyline is not joined to the first of the next.
+        is_segment[[vertex - 1 for vertex in self.starts]] = False
+        return np.flatnonzero(is_segment)
+
     def map_operands(self, change: Callable[[Solid], Solid]) -> Solid:
         return change(self)
 
@@ -238,10 +277,8 @@ class Tube(Solid):
     def _upload(self, backend: Backend) -> _TubeData:
         """Upload the segments as records to a backend. If there are many, they are grouped, and
         each group has a ball around it."""
-        is_segment = np.ones(len(self.points) - 1, dtype=np.bool_)
-        # The last vertex of a polyline is not joined to the first of the next.
-        is_segment[[vertex - 1 for vertex in self.starts]] = False
-        start, segment = self.points[:-1][is_segment], np.diff(self.points, axis=0)[is_segment]
+        first = self._segment_starts()
+        start, segment = self.points[first], np.diff(self.points, axis=0)[first]
         # A record: the start, the vector to the end, and 1 / length^2.
         rows = np.column_stack([start, segment, 1.0 / np.sum(segment * segment, axis=1)])
         groups = None
