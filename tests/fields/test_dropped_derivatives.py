@@ -174,6 +174,8 @@ GIVEN: dict[str, Any] = {
 WITH_DERIVATIVES = (
     {
         ("Surface", "field"),
+        ("picture", "surface"),
+        ("picture", "level"),
         ("Surface", "level"),
         ("signed_distance", "points"),
         ("smooth_union", "radius"),

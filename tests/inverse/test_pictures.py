@@ -156,7 +156,7 @@ def test_what_is_seen_inside() -> None:
     image = hk.picture(sphere, show=lambda hits: hits.position.z, background=-1.0, **view)
     assert image.shape == (33, 33, 1)
     assert image[0, 0, 0] == -1
-    assert image[16, 16, 0] == pytest.approx(0.7 * 1.6 / DISTANCE, abs=1e-6)
+    assert image[16, 16, 0] == pytest.approx(0.7 * 1.6 / DISTANCE, abs=1e-4)
     up = hk.picture(sphere, show="shaded", light=(0, 0, 1), **view)[16, 16, 0]
     assert up == pytest.approx(0.2 + 0.8 * 1.6 / DISTANCE, abs=1e-6)
 
@@ -247,9 +247,7 @@ def test_screen_and_space() -> None:
     rows = film.jacobian(points)
     for k in range(3):
         shift = 1e-6 * np.eye(3)[k]
-        ahead, back = (
-            film.directions(screen + s * 1e-6 * rows[:, :, k]) for s in (1, -1)
-        )
+        ahead, back = (film.directions(screen + s * 1e-6 * rows[:, :, k]) for s in (1, -1))
         for sign, expected in ((1, ahead), (-1, back)):
             moved = points + sign * shift - film.origin
             moved /= np.linalg.norm(moved, axis=1, keepdims=True)

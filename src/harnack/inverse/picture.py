@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_numpy
-from harnack.backend.validation import as_integer_in_range
+from harnack.backend.validation import as_integer_in_range, check_no_derivatives
 from harnack.inverse.channels import Show, channel_function
 from harnack.inverse.drawing import Drawing
 from harnack.inverse.film import Film, Grid
@@ -83,6 +83,8 @@ def picture(
 
     Warns if rays ran out of steps; these show the background.
     """
+    other = None if callable(show) else show
+    check_no_derivatives("picture", camera, size, samples, seed, background, light, other)
     camera = Camera() if camera is None else camera
     if not isinstance(cast("object", camera), Camera):
         raise TypeError(f"camera is a harnack.Camera, not {type(camera).__name__}")
