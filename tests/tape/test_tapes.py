@@ -354,6 +354,19 @@ def test_ranges_of_segments_and_cones_contain_all_values() -> None:
             assert values.max() <= high
 
 
+def test_short_formulas_have_a_proved_box() -> None:
+    """Rays beside a quartic miss at once; a paraboloid reaches to infinity, and has no box."""
+    field = hk.expression("x^4 + y^4 + z^4 = 1")
+    lower, upper = field.extent((0.0,)).bounds()
+    assert (lower <= -1).all()
+    assert (upper >= 1).all()
+    assert np.abs([lower, upper]).max() < 1.1
+    hits = hk.trace(field, [[3.0, 3, 3], [0, 0, 3]], [[0.0, 0, 1], [0, 0, -1]])
+    assert hits.status.tolist() == [int(hk.RayStatus.MISS), int(hk.RayStatus.HIT)]
+    assert hits.evaluations[0] == 0
+    assert hk.expression("x^2 + y^2 - z").extent((0.0,)) is None
+
+
 def test_a_text_of_many_spheres_has_a_proved_box() -> None:
     centers = np.random.default_rng(5).uniform(-0.5, 0.5, (60, 3)).round(4)
     texts = [f"sqrt((x-({a}))^2 + (y-({b}))^2 + (z-({c}))^2) - 0.1" for a, b, c in centers]

@@ -18,7 +18,7 @@ from harnack.fields.operands import common_domain, common_traits
 from harnack.fields.products import FieldProduct, extent_of_product
 from harnack.fields.sum_extents import WeightedTerms
 from harnack.fields.sums import FieldSum
-from harnack.fields.tape_evaluator import extent_of_long_formula
+from harnack.fields.tape_evaluator import extent_of_formula
 from harnack.fields.weights import as_number, is_number, separate_weights
 from harnack.name_suggestions import with_article
 
@@ -177,9 +177,9 @@ class FormulaSum(Formula):
         return WeightedTerms(self.terms, self.weights, self.constant)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets, as of `FieldSum`; or the box of a formula that is
-        interpreted."""
-        return self._weighted.extent(levels, self.domain) or extent_of_long_formula(self, levels)
+        """A volume that contains the level sets, as of `FieldSum`; or the box of its formula
+        (`extent_of_formula`)."""
+        return self._weighted.extent(levels, self.domain) or extent_of_formula(self, levels)
 
     def validate_levels(self, levels: tuple[float, ...]) -> None:
         self._weighted.validate_levels(levels)
@@ -211,10 +211,10 @@ class FormulaProduct(Formula):
         object.__setattr__(self, "traits", traits)
 
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
-        """A volume that contains the level sets, as of `FieldProduct`; or the box of a formula that
-        is interpreted."""
+        """A volume that contains the level sets, as of `FieldProduct`; or the box of its
+        formula (`extent_of_formula`)."""
         known = extent_of_product(self.factors, levels, self.domain)
-        return known or extent_of_long_formula(self, levels)
+        return known or extent_of_formula(self, levels)
 
     def formula(self, x: Any, y: Any, z: Any) -> Any:
         first, second = self.factors

@@ -23,7 +23,7 @@ from harnack.arithmetic.operators import FormulaNumber
 from harnack.backend.validation import as_finite, check_no_derivatives, flag
 from harnack.fields.formula import Formula, probe_jets, warn_if_slow_to_compile
 from harnack.fields.formula_evaluator import as_jet
-from harnack.fields.tape_evaluator import extent_of_long_formula, recorded_tape
+from harnack.fields.tape_evaluator import extent_of_formula, recorded_tape
 from harnack.fields.vm_formulas import VmFormula
 from harnack.geometry import Volume
 from harnack.name_suggestions import did_you_mean
@@ -381,7 +381,7 @@ class Expression(Formula):
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         if self.domain is not None:
             return self.domain
-        return extent_of_long_formula(self, levels)
+        return extent_of_formula(self, levels)
 
 
 class ExpressionFunction(Protocol):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from harnack.fields.evaluator import Plan
     from harnack.geometry import Volume
 
-__all__ = ["TapeEvaluator", "extent_of_long_formula", "recorded_tape", "tape_evaluator"]
+__all__ = ["TapeEvaluator", "extent_of_formula", "recorded_tape", "tape_evaluator"]
 
 # Formulas of more instructions are interpreted, and combinations of more than half as many, since
 # much of them is left out in each cell; shorter ones are compiled.
@@ -105,15 +105,14 @@ def _is_long(field: Any, shortest: int | None) -> bool:
     return tape.operation_count > shortest or tape.call_count > _MAX_OPERATIONS
 
 
-def extent_of_long_formula(field: Any, levels: tuple[float, ...]) -> Volume | None:
-    """A box that contains the level sets of a formula that is interpreted, by its ranges on
-    half-spaces; None for other formulas, and if none is found."""
-    if not levels or not _is_long(field, None):
+def extent_of_formula(field: Any, levels: tuple[float, ...]) -> Volume | None:
+    """A box that contains the level sets of a formula, by its ranges on half-spaces; None if none
+    is found, and for formulas that cannot be recorded."""
+    tape = recorded_tape(field) if levels else None
+    if tape is None:
         return None
     kept = _BOXES.get(field, None, dict)
     if levels not in kept:
-        tape = recorded_tape(field)
-        assert tape is not None
         kept[levels] = level_box(tape, levels)
     corners = kept[levels]
     if corners is None:
