@@ -20,6 +20,7 @@ from .clouds import clouds
 from .cluster import cluster
 from .convergence import plot
 from .curve_cells import curve_cells
+from .derivatives import derivatives
 from .distances import distances
 from .formulas import formulas
 from .growth import growth
@@ -43,7 +44,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 SECTIONS = (
     "rays", "convergence", "winding", "agreement", "versions", "inclusion", "laplacian", "hart",
     "povray", "antialiasing", "baselines", "formulas", "meshes", "repair", "clouds", "distances",
-    "pictures", "live", "cluster", "curves", "hollow", "parts", "networks",
+    "derivatives", "pictures", "live", "cluster", "curves", "hollow", "parts", "networks",
 )  # fmt: skip
 
 
@@ -93,6 +94,7 @@ def main() -> None:
         "hollow": lambda: hollow(arguments.meshes),
         "inclusion": inclusion,
         "laplacian": laplacian,
+        "derivatives": derivatives,
         "hart": hart,
         "antialiasing": antialiasing,
         "baselines": baselines,
