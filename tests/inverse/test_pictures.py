@@ -283,11 +283,23 @@ def test_what_cannot_be_done_is_refused() -> None:
         ({"background": (1.0, 2.0)}, "background has 2 numbers"),
         ({"background": "blue"}, "background"),
         ({"precision": "single"}, "parameters are in double"),
+        ({"backend": "webgpu"}, "picture has no backend"),
+        ({"side": "below"}, "picture has no side"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
             hk.picture(sphere, **{**small, **wrong})
     with pytest.raises(ValueError, match="reaches to infinity"):
         hk.picture(hk.expression("z - x*y"), size=8)
+
+
+def test_surfaces_of_facets_and_patches_are_drawn() -> None:
+    vertices, faces = hk.geometry.example_meshes.icosphere(2)
+    mask = hk.picture(hk.WindingNumber(vertices, faces), camera=CAMERA, size=32, show="mask")
+    assert mask.mean() == pytest.approx(disk_share(1.0), rel=0.05)
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.3], [0, 1, 0]])
+    mesh = hk.PolygonMesh(square, [[0, 1, 2, 3]])
+    camera = hk.Camera(position=(0.5, 0.5, 3.0), target=(0.5, 0.5, 0), fov=40)
+    assert hk.picture(mesh, camera=camera, size=16, show="mask")[8, 8, 0] == 1
 
 
 def test_lost_rays_are_told() -> None:

@@ -94,6 +94,13 @@ class BoundaryMotion:
     position: FloatArray
     weight: FloatArray
 
+    @classmethod
+    def unknown(cls, count: int) -> BoundaryMotion:
+        """Points that move in no known way, such as those of surfaces of facets or patches."""
+        kind = np.full(count, int(BoundaryKind.UNKNOWN))
+        index, nothing = np.zeros(0, np.int64), np.zeros((0, 3))
+        return cls(kind, np.zeros((count, 2)), index, nothing, np.zeros(0))
+
 
 def boundary_motion(
     jumps: Discontinuities, film: Film, surface: TracedSurface, tracer: SurfaceTracer
@@ -104,6 +111,9 @@ def boundary_motion(
     surface, tracer: the surface, and its tracer in the double precision in which the points were
         found.
     """
+    traits = surface.field.traits
+    if traits.has_jumps or traits.has_patches or not len(jumps):
+        return BoundaryMotion.unknown(len(jumps))
     before, behind = jumps.before, jumps.behind
     is_front = before.t <= behind.t
     x = np.where(is_front[:, None], before.position, behind.position)
@@ -137,7 +147,7 @@ def boundary_motion(
             conditions.set_second(index, beside[1], gradients[1])
             x[index] = curve[index]
     cut = intersection_of([surface.field.domain, surface.clip_volume])
-    if cut is not None and len(x):
+    if cut is not None:
         depth = to_numpy(cut.signed_distance(upload_vectors(tracer.backend, x)))
         if (index := take(np.abs(depth) < near, BoundaryKind.CUT)).size:
             normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
@@ -146,8 +156,8 @@ def boundary_motion(
         contact = _contact(tracer, x[index], g[index], directions[index], width[index])
         conditions.set_first(index, contact, _gradients(tracer, contact))
         x[index] = contact
-    traits, left = surface.field.traits, np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
-    if left.size and not traits.has_jumps and not traits.has_patches:
+    left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
+    if left.size:
         first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
         index, first, second = left[is_edge], first[is_edge], second[is_edge]
         kind[index] = int(BoundaryKind.EDGE)
@@ -277,7 +287,7 @@ def _closest_on_curves(tracer: SurfaceTracer, x: FloatArray) -> FloatArray | Non
     """The points (n, 3), closest to points x (n, 3), of the curves at which all level sets end;
     None if there are no such curves."""
     boundary = tracer.field.boundary
-    if boundary is None or boundary.closest_point is None or not len(x):
+    if boundary is None or boundary.closest_point is None:
         return None
     closest = boundary.closest_point(upload_vectors(tracer.backend, x))
     return to_numpy(closest).reshape(-1, 3)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from harnack.tracer import Hits, Surface
     from harnack.tracer.trace_options import TraceKeywords, TraceOptions
 
-_HONORED = ("level", "clip", "section", *TRACE_OPTIONS)
+_HONORED = ("level", "clip", "section", *(name for name in TRACE_OPTIONS if name != "backend"))
 # Pictures of more pixels a side, and of more samples, are refused: they need too much memory.
 _MAX_SIDE, _MAX_SAMPLES = 8192, 16
 
