@@ -150,6 +150,8 @@ def find_discontinuities(
     threshold = _SMALLEST_JUMP * float(np.ptp(color, axis=(0, 1)).max())
     axes: list[IntArray] = []
     ends: list[FloatArray] = []
+    sides: list[FloatArray] = []
+    bends: list[BoolArray] = []
     for axis, hit, shown, along, across in (
         (0, is_hit[1:-1], color[1:-1], grid.columns, grid.rows[1:-1]),
         (1, is_hit[:, 1:-1].T, color[:, 1:-1].swapaxes(0, 1), grid.rows, grid.columns[1:-1]),
@@ -160,7 +162,11 @@ def find_discontinuities(
         start[:, 1 - axis] = end[:, 1 - axis] = across[line]
         axes.append(np.full(len(k), axis))
         ends.append(np.stack([start, end], axis=1))
+        sides.append(np.stack([shown[line, k], shown[line, k + 1]]).swapaxes(0, 1))
+        bends.append(hit[line, k] & hit[line, k + 1])
     axis, screen = np.concatenate(axes), np.concatenate(ends)
+    keep = _without_smooth(np.concatenate(bends), screen, np.concatenate(sides), look, threshold)
+    axis, screen = axis[keep], screen[keep]
     points = _divisions(screen)
     seen = look(points.reshape(-1, 2))
     jumps = _between(axis, points, seen, threshold)
@@ -172,6 +178,24 @@ def find_discontinuities(
         seen = Seen.joined([jumps.before, inner, jumps.behind])
         jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == rounds)
     return jumps
+
+
+def _without_smooth(
+    is_hit: BoolArray, screen: FloatArray, color: FloatArray,
+    look: Callable[[FloatArray], Seen], threshold: float,
+) -> BoolArray:  # fmt: skip
+    """Which of n intervals to divide: those with both ends on the surface only if the ray through
+    their middle misses or shows that the color bends. Of a smooth color's bend it finds a quarter,
+    and of a jump all.
+
+    is_hit: (n,) whether both ends are on the surface.
+    screen, color: (n, 2, 2) and (n, 2, c) the ends, and what is seen there.
+    """
+    keep, index = np.ones(len(is_hit), bool), np.flatnonzero(is_hit)
+    middle = look(screen[index].mean(axis=1))
+    bend = np.abs(color[index].sum(axis=1) - 2 * middle.color).max(axis=-1)
+    keep[index] = ~middle.is_hit | (bend > threshold)
+    return keep
 
 
 def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArray:
@@ -210,7 +234,9 @@ def _between(
     count, total = len(axis), len(seen.is_hit)
     before, behind = seen.at(np.arange(total - count)), seen.at(np.arange(count, total))
     parts = Discontinuities(np.tile(axis, _PARTS), ends, before, behind, threshold)
-    differ = before.differs_from(behind, threshold)
+    shape = _PARTS + 1, count
+    hit, color = seen.is_hit.reshape(shape), seen.color.reshape(*shape, -1)
+    differ = _may_jump(hit.T, color.swapaxes(0, 1), threshold).T.ravel()
     if is_last:
         color, first_of_last = seen.color, total - count
         whole = np.tile(np.abs(color[first_of_last:] - color[:count]).max(axis=1), _PARTS)

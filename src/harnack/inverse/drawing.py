@@ -201,8 +201,8 @@ class Drawing:
     def _on_level(self, hits: Hits, rays: RayBatch) -> Hits:
         """The hits of rays, moved from within the tolerance onto the level: near the curves at
         which level sets end, normals depend on it. Hits on facets and patches are exact already."""
-        traits = self.surface.field.traits
-        if traits.has_jumps or traits.has_patches:
+        boundary = self._fine_tracer.field.boundary
+        if boundary is None or boundary.closest_point is None:
             return hits
         tracer, is_hit = self._fine_tracer, hits.is_hit
         _, t, x, sample = hits_on_level(
