@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from harnack.inverse.film import Grid
 
 # An interval of a scanline is cut into this many parts, so many times: 1/216 of the distance of the
-# lines. Where colors change on the surface, it is more: at 1/7,776 of a pixel from an outline that
-# bends with a radius of 10 pixels, the normal has turned by 0.3 degrees.
-_PARTS, _ROUNDS, _COLOR_ROUNDS = 6, 3, 5
+# lines.
+_PARTS, _ROUNDS = 6, 3
 # Jumps of the color count from this fraction of the picture's range of colors on.
 _SMALLEST_JUMP = 0.004
 # A jump has at least this part of the change of color in the interval that was divided last.
@@ -135,14 +134,12 @@ def jump_weights(jumps: Discontinuities, pieces: FloatArray) -> FloatArray:
 
 
 def find_discontinuities(
-    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen],
-    *, is_constant: bool,
+    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen]
 ) -> Discontinuities:  # fmt: skip
     """Find the jumps of a picture on the scanlines of a grid of rays.
 
     is_hit, color: (k, m) and (k, m, c) what the rays through the points of the grid see.
     look: what rays through screen points (n, 2) see.
-    is_constant: whether all points of the surface have the same color.
 
     Two jumps between neighbors that undo each other, as of a wire that is thinner than the distance
     of the lines, are not found (`piece_weights`).
@@ -170,13 +167,12 @@ def find_discontinuities(
     points = _divisions(screen)
     seen = look(points.reshape(-1, 2))
     jumps = _between(axis, points, seen, threshold)
-    rounds = _ROUNDS if is_constant else _COLOR_ROUNDS
-    for k in range(1, rounds):
+    for k in range(1, _ROUNDS):
         points = _divisions(jumps.screen)
         # The ends have been looked at.
         inner = look(points[1:-1].reshape(-1, 2))
         seen = Seen.joined([jumps.before, inner, jumps.behind])
-        jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == rounds)
+        jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == _ROUNDS)
     return jumps
 
 
