@@ -207,6 +207,19 @@ def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArr
     return (is_hit[:, 1:] != is_hit[:, :-1]) | (is_large & bends)
 
 
+def _stands_out(values: FloatArray, threshold: float) -> BoolArray:
+    """Where the change from one of m points (m, n, c) to the next is by more than the threshold
+    above that before it and that behind it, or below both: (m - 1, n). There the values jump; where
+    they are only steep, as near outlines, each change is larger than the last."""
+    change = np.diff(values, axis=0)
+    more = np.diff(change, axis=0)
+    # The first and the last change have one neighbor.
+    before = np.concatenate([-more[:1], more])
+    behind = np.concatenate([-more, more[-1:]])
+    is_peak = (np.minimum(before, behind) > threshold) | (np.maximum(before, behind) < -threshold)
+    return is_peak.any(axis=-1)
+
+
 def _divisions(screen: FloatArray) -> FloatArray:
     """The points (parts + 1, n, 2) that divide intervals (n, 2, 2) into parts, with their ends."""
     fraction = np.linspace(0, 1, _PARTS + 1)[:, None, None]
@@ -217,8 +230,8 @@ def _divisions(screen: FloatArray) -> FloatArray:
 def _between(
     axis: IntArray, points: FloatArray, seen: Seen, threshold: float, *, is_last: bool = False
 ) -> Discontinuities:
-    """The parts of n intervals whose ends see different things. A smooth change of color is not
-    kept for long, since it is divided among the parts.
+    """The parts of n intervals whose ends see different things: only one of them the surface, or
+    other colors, with a change of color or of depth unlike that in the parts beside it.
 
     axis: (n,) the directions of the scanlines.
     points, seen: (parts + 1, n, 2) the ends of the parts, and what is seen there, in this order.
@@ -230,9 +243,12 @@ def _between(
     count, total = len(axis), len(seen.is_hit)
     before, behind = seen.at(np.arange(total - count)), seen.at(np.arange(count, total))
     parts = Discontinuities(np.tile(axis, _PARTS), ends, before, behind, threshold)
-    shape = _PARTS + 1, count
-    hit, color = seen.is_hit.reshape(shape), seen.color.reshape(*shape, -1)
-    differ = _may_jump(hit.T, color.swapaxes(0, 1), threshold).T.ravel()
+    color = seen.color.reshape(_PARTS + 1, count, seen.color.shape[-1])
+    t = np.where(seen.is_hit, seen.t, 0).reshape(_PARTS + 1, count, 1)
+    t_threshold = _SMALLEST_JUMP * float(np.ptp(seen.t[seen.is_hit])) if seen.is_hit.any() else 0.0
+    stands_out = _stands_out(color, threshold) | _stands_out(t, t_threshold)
+    differ = before.differs_from(behind, threshold)
+    differ &= (before.is_hit != behind.is_hit) | stands_out.ravel()
     if is_last:
         color, first_of_last = seen.color, total - count
         whole = np.tile(np.abs(color[first_of_last:] - color[:count]).max(axis=1), _PARTS)
