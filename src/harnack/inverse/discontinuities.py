@@ -216,8 +216,8 @@ def _stands_out(values: FloatArray, threshold: float) -> BoolArray:
     # The first and the last change have one neighbor.
     before = np.concatenate([-more[:1], more])
     behind = np.concatenate([-more, more[-1:]])
-    is_peak = (np.minimum(before, behind) > threshold) | (np.maximum(before, behind) < -threshold)
-    return is_peak.any(axis=-1)
+    height = np.maximum(np.minimum(before, behind), -np.maximum(before, behind))
+    return height.max(axis=-1) > threshold
 
 
 def _divisions(screen: FloatArray) -> FloatArray:

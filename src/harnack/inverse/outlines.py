@@ -29,7 +29,7 @@ from harnack.tracer.hits import Hits
 from harnack.tracer.level_contact import RayStatus
 
 if TYPE_CHECKING:
-    from harnack.backend import Real, Vec3
+    from harnack.backend import FloatArray, Real, Vec3
     from harnack.inverse.boundary_motion import BoundaryMotion
     from harnack.inverse.channels import ChannelFunction
     from harnack.inverse.discontinuities import Discontinuities
@@ -81,8 +81,8 @@ def with_exact_outlines(
     motions = depth * (film.directions(moved) - film.directions(inside)) / _DIFFERENCE
     low, high = ends[n, 0, axis], ends[n, 1, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
-        place = inside[n, axis] + gap / (gradient * motions).sum(axis=1)
-    place = np.where(np.isfinite(place), np.clip(place, low, high), (low + high) / 2)
+        found: FloatArray = inside[n, axis] + gap / (gradient * motions).sum(axis=1)
+    place: FloatArray = np.where(np.isfinite(found), np.clip(found, low, high), (low + high) / 2)
     screen = jumps.screen.copy()
     screen[index, :, axis] += (place - (low + high) / 2)[:, None]
     return replace(
