@@ -89,6 +89,7 @@ CONTENTS = {
         "docs/printing",
         "docs/live",
         "docs/frameworks",
+        "docs/fitting",
         "docs/precision",
         "docs/distances",
         "docs/cluster",

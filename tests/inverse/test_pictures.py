@@ -207,15 +207,33 @@ def test_tensors_keep_their_precision() -> None:
     assert isinstance(plain, TensorXf)
 
 
+def moved_solid(k: int) -> tuple[list[Any], Any]:
+    radius = Float64(0.5 + 0.01 * k)
+    dr.enable_grad(radius)
+    return [radius], hk.Sphere(radius) | hk.Cuboid((0.5, 0.5, 0.9))
+
+
+def moved_curve(k: int) -> tuple[list[Any], Any]:
+    vertices = TensorXf64(LOOP * (1 + 0.02 * k))
+    dr.enable_grad(vertices)
+    return [vertices], hk.SolidAngle(vertices)
+
+
+def moved_points(k: int) -> tuple[list[Any], Any]:
+    points = hk.geometry.example_meshes.icosphere(1)[0]
+    numbers = [TensorXf64(a) for a in (0.6 * points * (1 + 0.02 * k), points, np.full(42, 0.1))]
+    dr.enable_grad(numbers)
+    return numbers, hk.DipolePotential(*numbers, smoothing=0.2)
+
+
 @pytest.mark.slow
-def test_a_step_of_an_optimization_compiles_nothing() -> None:
+@pytest.mark.parametrize("make", [moved_solid, moved_curve, moved_points])
+def test_a_step_of_an_optimization_compiles_nothing(make: Any) -> None:
     def step(k: int) -> None:
-        radius = Float64(0.5 + 0.01 * k)
-        dr.enable_grad(radius)
-        solid = hk.Sphere(radius) | hk.Cuboid((0.5, 0.5, 0.9))
-        image = hk.picture(solid, camera=CAMERA, size=24, seed=k)
+        numbers, field = make(k)
+        image = hk.picture(field, camera=CAMERA, size=24, seed=k)
         dr.backward(dr.mean(image, axis=None))
-        dr.eval(dr.grad(radius))
+        dr.eval(dr.grad(numbers))
 
     for k in range(3):
         step(k)

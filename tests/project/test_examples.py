@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+import harnack as hk
 from tests.oracles.mesh_files import read_closed
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -115,3 +116,36 @@ def test_a_film_has_its_frames(tmp_path: Path) -> None:
     film = example("film").main(tmp_path, SMALL, frames=4)
     with Image.open(film) as opened:
         assert opened.n_frames == 4
+
+
+@pytest.mark.slow
+def test_a_curve_is_found_in_three_masks(tmp_path: Path) -> None:
+    assert example("fitted_curve").main(tmp_path, (32, 24), steps=12, n=16) < 0.05
+
+
+@pytest.mark.slow
+def test_numbers_of_shapes_are_found_in_pictures(tmp_path: Path) -> None:
+    module = example("fitted_shapes")
+    fit = module.FITS["part"]
+    path = fit.run(24, 12)
+    before, after = (np.abs(x - fit.truth).sum() for x in (path[0], path[-1]))
+    assert after < 0.7 * before
+
+
+@pytest.mark.slow
+def test_points_are_found_in_pictures(tmp_path: Path) -> None:
+    before, after = example("fitted_points").main(tmp_path, (24, 24), steps=6, n=100)
+    assert after < 0.8 * before
+
+
+@pytest.mark.slow
+def test_a_trefoil_is_found_in_masks_and_other_knots_are_told_apart(tmp_path: Path) -> None:
+    module = example("fitted_knot")
+    determinant, error = module.main(tmp_path, (24, 18), steps=12, n=24)
+    assert determinant == 3
+    assert error < 0.06
+    curves = hk.geometry.example_curves
+    assert module.knot_determinant(curves.regular_polygon(20)) == 1
+    assert module.knot_determinant(curves.figure_eight_knot(60)) == 5
+    assert module.knot_determinant(curves.torus_knot(2, 5, 60)) == 5
+    assert module.knot_determinant(curves.torus_knot(2, 7, 80)) == 7

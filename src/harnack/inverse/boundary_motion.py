@@ -119,11 +119,13 @@ def boundary_motion(
     x = np.where(is_front[:, None], before.position, behind.position)
     other = np.where(is_front[:, None], behind.position, before.position)
     g, directions = _gradients(tracer, x), film.directions(jumps.middle)
-    with np.errstate(invalid="ignore"):  # normals of facets are no gradients
-        sine = np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
+    sine, other_sine = _sines(g, directions), _sines(_gradients(tracer, other), directions)
     width = film.pixel_width(x)
     resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
     near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
+    # The two sides of a crease are apart by what the flatter one is seen to recede.
+    flatter = np.fmin(sine, other_sine)
+    near_other = _SAME_POINT * resolution * width / np.maximum(flatter, _TOUCHING)
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
     conditions = _Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
 
@@ -134,7 +136,7 @@ def boundary_motion(
         return index
 
     with np.errstate(invalid="ignore"):
-        is_same = np.linalg.norm(x - other, axis=1) < near
+        is_same = np.linalg.norm(x - other, axis=1) < near_other
     if (index := take(before.is_hit & behind.is_hit & is_same, BoundaryKind.CREASE)).size:
         conditions.set_second(index, other[index], _gradients(tracer, other[index]))
     curve = _closest_on_curves(tracer, x)
@@ -225,6 +227,12 @@ def _solved(
         np.concatenate([conditions.position[known], conditions.second_position[pairs]]),
         np.concatenate([weight[known], second_weight[pairs]]),
     )
+
+
+def _sines(g: FloatArray, directions: FloatArray) -> FloatArray:
+    """The sines (n,) of the angles between rays (n, 3) and level sets with gradients g (n, 3)."""
+    with np.errstate(invalid="ignore"):  # normals of facets are no gradients
+        return np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
 
 
 def _dots(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from harnack.inverse.film import Grid
 
 # An interval of a scanline is cut into this many parts, so many times: 1/216 of the distance of the
-# lines. Where colors change on the surface, it is more: at 1/7,776 of a pixel from an outline that
-# bends with a radius of 10 pixels, the normal has turned by 0.3 degrees.
-_PARTS, _ROUNDS, _COLOR_ROUNDS = 6, 3, 5
+# lines.
+_PARTS, _ROUNDS = 6, 3
 # Jumps of the color count from this fraction of the picture's range of colors on.
 _SMALLEST_JUMP = 0.004
 # A jump has at least this part of the change of color in the interval that was divided last.
@@ -135,14 +134,12 @@ def jump_weights(jumps: Discontinuities, pieces: FloatArray) -> FloatArray:
 
 
 def find_discontinuities(
-    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen],
-    *, is_constant: bool,
+    grid: Grid, is_hit: BoolArray, color: FloatArray, look: Callable[[FloatArray], Seen]
 ) -> Discontinuities:  # fmt: skip
     """Find the jumps of a picture on the scanlines of a grid of rays.
 
     is_hit, color: (k, m) and (k, m, c) what the rays through the points of the grid see.
     look: what rays through screen points (n, 2) see.
-    is_constant: whether all points of the surface have the same color.
 
     Two jumps between neighbors that undo each other, as of a wire that is thinner than the distance
     of the lines, are not found (`piece_weights`).
@@ -150,6 +147,8 @@ def find_discontinuities(
     threshold = _SMALLEST_JUMP * float(np.ptp(color, axis=(0, 1)).max())
     axes: list[IntArray] = []
     ends: list[FloatArray] = []
+    sides: list[FloatArray] = []
+    bends: list[BoolArray] = []
     for axis, hit, shown, along, across in (
         (0, is_hit[1:-1], color[1:-1], grid.columns, grid.rows[1:-1]),
         (1, is_hit[:, 1:-1].T, color[:, 1:-1].swapaxes(0, 1), grid.rows, grid.columns[1:-1]),
@@ -160,18 +159,39 @@ def find_discontinuities(
         start[:, 1 - axis] = end[:, 1 - axis] = across[line]
         axes.append(np.full(len(k), axis))
         ends.append(np.stack([start, end], axis=1))
+        sides.append(np.stack([shown[line, k], shown[line, k + 1]]).swapaxes(0, 1))
+        bends.append(hit[line, k] & hit[line, k + 1])
     axis, screen = np.concatenate(axes), np.concatenate(ends)
+    keep = _without_smooth(np.concatenate(bends), screen, np.concatenate(sides), look, threshold)
+    axis, screen = axis[keep], screen[keep]
     points = _divisions(screen)
     seen = look(points.reshape(-1, 2))
     jumps = _between(axis, points, seen, threshold)
-    rounds = _ROUNDS if is_constant else _COLOR_ROUNDS
-    for k in range(1, rounds):
+    for k in range(1, _ROUNDS):
         points = _divisions(jumps.screen)
         # The ends have been looked at.
         inner = look(points[1:-1].reshape(-1, 2))
         seen = Seen.joined([jumps.before, inner, jumps.behind])
-        jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == rounds)
+        jumps = _between(jumps.axis, points, seen, threshold, is_last=k + 1 == _ROUNDS)
     return jumps
+
+
+def _without_smooth(
+    is_hit: BoolArray, screen: FloatArray, color: FloatArray,
+    look: Callable[[FloatArray], Seen], threshold: float,
+) -> BoolArray:  # fmt: skip
+    """Which of n intervals to divide: those with both ends on the surface only if the ray through
+    their middle misses or shows that the color bends. Of a smooth color's bend it finds a quarter,
+    and of a jump all.
+
+    is_hit: (n,) whether both ends are on the surface.
+    screen, color: (n, 2, 2) and (n, 2, c) the ends, and what is seen there.
+    """
+    keep, index = np.ones(len(is_hit), bool), np.flatnonzero(is_hit)
+    middle = look(screen[index].mean(axis=1))
+    bend = np.abs(color[index].sum(axis=1) - 2 * middle.color).max(axis=-1)
+    keep[index] = ~middle.is_hit | (bend > threshold)
+    return keep
 
 
 def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArray:
@@ -187,6 +207,19 @@ def _may_jump(is_hit: BoolArray, color: FloatArray, threshold: float) -> BoolArr
     return (is_hit[:, 1:] != is_hit[:, :-1]) | (is_large & bends)
 
 
+def _stands_out(values: FloatArray, threshold: float) -> BoolArray:
+    """Where the change from one of m points (m, n, c) to the next is by more than the threshold
+    above that before it and that behind it, or below both: (m - 1, n). There the values jump; where
+    they are only steep, as near outlines, each change is larger than the last."""
+    change = np.diff(values, axis=0)
+    more = np.diff(change, axis=0)
+    # The first and the last change have one neighbor.
+    before = np.concatenate([-more[:1], more])
+    behind = np.concatenate([-more, more[-1:]])
+    height = np.maximum(np.minimum(before, behind), -np.maximum(before, behind))
+    return height.max(axis=-1) > threshold
+
+
 def _divisions(screen: FloatArray) -> FloatArray:
     """The points (parts + 1, n, 2) that divide intervals (n, 2, 2) into parts, with their ends."""
     fraction = np.linspace(0, 1, _PARTS + 1)[:, None, None]
@@ -197,8 +230,8 @@ def _divisions(screen: FloatArray) -> FloatArray:
 def _between(
     axis: IntArray, points: FloatArray, seen: Seen, threshold: float, *, is_last: bool = False
 ) -> Discontinuities:
-    """The parts of n intervals whose ends see different things. A smooth change of color is not
-    kept for long, since it is divided among the parts.
+    """The parts of n intervals whose ends see different things: only one of them the surface, or
+    other colors, with a change of color or of depth unlike that in the parts beside it.
 
     axis: (n,) the directions of the scanlines.
     points, seen: (parts + 1, n, 2) the ends of the parts, and what is seen there, in this order.
@@ -210,7 +243,12 @@ def _between(
     count, total = len(axis), len(seen.is_hit)
     before, behind = seen.at(np.arange(total - count)), seen.at(np.arange(count, total))
     parts = Discontinuities(np.tile(axis, _PARTS), ends, before, behind, threshold)
+    color = seen.color.reshape(_PARTS + 1, count, seen.color.shape[-1])
+    t = np.where(seen.is_hit, seen.t, 0).reshape(_PARTS + 1, count, 1)
+    t_threshold = _SMALLEST_JUMP * float(np.ptp(seen.t[seen.is_hit])) if seen.is_hit.any() else 0.0
+    stands_out = _stands_out(color, threshold) | _stands_out(t, t_threshold)
     differ = before.differs_from(behind, threshold)
+    differ &= (before.is_hit != behind.is_hit) | stands_out.ravel()
     if is_last:
         color, first_of_last = seen.color, total - count
         whole = np.tile(np.abs(color[first_of_last:] - color[:count]).max(axis=1), _PARTS)

@@ -44,6 +44,7 @@ from harnack.inverse.discontinuities import (
     piece_weights,
 )
 from harnack.inverse.film import has_fixed_pose, pixel_indices
+from harnack.inverse.outlines import with_exact_outlines
 from harnack.inverse.scanline_samples import scanline_samples
 from harnack.name_suggestions import with_article
 from harnack.tracer.derivatives import (
@@ -103,10 +104,10 @@ class Drawing:
         has_derivatives = self._has_derivatives
         colors, is_hit = self._colors_on_grid()
         image = self._averaged(colors)
-        jumps = find_discontinuities(
-            self.grid, is_hit, colors, self._look, is_constant=self.channels.is_constant
-        )
+        jumps = find_discontinuities(self.grid, is_hit, colors, self._look)
         motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
+        if not self.channels.is_constant:
+            jumps = with_exact_outlines(jumps, motion, self.film, self._fine_tracer, self.channels)
         pieces = np.ones(len(jumps)) if self.random is None else piece_weights(jumps, self.grid)
         weights = jump_weights(jumps, pieces)
         image = image + self._smoothing(jumps, motion, weights)
@@ -201,8 +202,8 @@ class Drawing:
     def _on_level(self, hits: Hits, rays: RayBatch) -> Hits:
         """The hits of rays, moved from within the tolerance onto the level: near the curves at
         which level sets end, normals depend on it. Hits on facets and patches are exact already."""
-        traits = self.surface.field.traits
-        if traits.has_jumps or traits.has_patches:
+        boundary = self._fine_tracer.field.boundary
+        if boundary is None or boundary.closest_point is None:
             return hits
         tracer, is_hit = self._fine_tracer, hits.is_hit
         _, t, x, sample = hits_on_level(
