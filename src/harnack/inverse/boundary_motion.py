@@ -41,7 +41,7 @@ from harnack.tracer.surface import intersection_of
 if TYPE_CHECKING:
     from harnack.backend import BoolArray, FloatArray, IntArray
     from harnack.inverse.discontinuities import Discontinuities
-    from harnack.inverse.film import Film
+    from harnack.inverse.film import Screen
     from harnack.tracer.surface_tracer import SurfaceTracer
     from harnack.tracer.traced_surface import TracedSurface
 
@@ -55,8 +55,9 @@ _TOUCHING = 0.1
 # For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
 # at most this part of the width of a pixel from the edge.
 _INSIDE, _LONGEST_EDGE = 0.02, 0.5
-# Two gradients are parallel if the squared sine of their angle is below this number: 1.1 degrees.
-_PARALLEL = 4e-4
+PARALLEL = 4e-4
+"""Two gradients are parallel if the squared sine of their angle is below this number: 1.1
+degrees."""
 # Points of contact are found by one step of Newton's method along the ray, with a difference of
 # gradients over this part of the width of a pixel; steps of more widths than this are not made.
 _DIFFERENCE, _LONGEST_STEP = 0.05, 30.0
@@ -73,7 +74,8 @@ class BoundaryKind(IntEnum):
     EDGE = 2
     CUT = 3
     END = 4
-    UNKNOWN = 5
+    SHADOW = 5
+    UNKNOWN = 6
 
 
 @dataclass(frozen=True)
@@ -103,11 +105,13 @@ class BoundaryMotion:
 
 
 def boundary_motion(
-    jumps: Discontinuities, film: Film, surface: TracedSurface, tracer: SurfaceTracer
+    jumps: Discontinuities, film: Screen, surface: TracedSurface, tracer: SurfaceTracer
 ) -> BoundaryMotion:
-    """Tell how the points at which a picture jumps move.
+    """Tell how the points at which a picture jumps move. Edges of shadows are of an unknown kind
+    here; `shadow_motion` tells theirs.
 
     jumps: the points, with what is seen on both sides.
+    film: where points of the surface are seen.
     surface, tracer: the surface, and its tracer in the double precision in which the points were
         found.
     """
@@ -118,8 +122,8 @@ def boundary_motion(
     is_front = before.t <= behind.t
     x = np.where(is_front[:, None], before.position, behind.position)
     other = np.where(is_front[:, None], behind.position, before.position)
-    g, directions = _gradients(tracer, x), film.directions(jumps.middle)
-    sine, other_sine = _sines(g, directions), _sines(_gradients(tracer, other), directions)
+    g, directions = gradients_at(tracer, x), film.directions(jumps.middle)
+    sine, other_sine = _sines(g, directions), _sines(gradients_at(tracer, other), directions)
     width = film.pixel_width(x)
     resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
     near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
@@ -127,7 +131,7 @@ def boundary_motion(
     flatter = np.fmin(sine, other_sine)
     near_other = _SAME_POINT * resolution * width / np.maximum(flatter, _TOUCHING)
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
-    conditions = _Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
+    conditions = Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
 
     def take(which: BoolArray, value: BoundaryKind) -> IntArray:
         """Give points that have no kind yet this one; returns their indices."""
@@ -138,13 +142,13 @@ def boundary_motion(
     with np.errstate(invalid="ignore"):
         is_same = np.linalg.norm(x - other, axis=1) < near_other
     if (index := take(before.is_hit & behind.is_hit & is_same, BoundaryKind.CREASE)).size:
-        conditions.set_second(index, other[index], _gradients(tracer, other[index]))
+        conditions.set_second(index, other[index], gradients_at(tracer, other[index]))
     curve = _closest_on_curves(tracer, x)
     if curve is not None:
         is_near = np.linalg.norm(x - curve, axis=1) < near
         if (index := take(is_near, BoundaryKind.END)).size:
             beside = _beside_curve(x[index], curve[index], g[index])
-            gradients = [_gradients(tracer, points) for points in beside]
+            gradients = [gradients_at(tracer, points) for points in beside]
             conditions.set_first(index, beside[0], gradients[0])
             conditions.set_second(index, beside[1], gradients[1])
             x[index] = curve[index]
@@ -156,20 +160,20 @@ def boundary_motion(
             conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
     if (index := take(sine < _TOUCHING, BoundaryKind.OUTLINE)).size:
         contact = _contact(tracer, x[index], g[index], directions[index], width[index])
-        conditions.set_first(index, contact, _gradients(tracer, contact))
+        conditions.set_first(index, contact, gradients_at(tracer, contact))
         x[index] = contact
     left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size:
         first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
         index, first, second = left[is_edge], first[is_edge], second[is_edge]
         kind[index] = int(BoundaryKind.EDGE)
-        conditions.set_first(index, first, _gradients(tracer, first))
-        conditions.set_second(index, second, _gradients(tracer, second))
-    return _solved(jumps, film, kind, x, conditions)
+        conditions.set_first(index, first, gradients_at(tracer, first))
+        conditions.set_second(index, second, gradients_at(tracer, second))
+    return solve_conditions(jumps, film, kind, x, conditions)
 
 
 @dataclass(frozen=True)
-class _Conditions:
+class Conditions:
     """The conditions g1 . dx = -df1 and, for pairs, g2 . dx = -df2, by which n points stay on a
     boundary.
 
@@ -191,15 +195,16 @@ class _Conditions:
         self.second_position[index], self.second_gradient[index] = position, gradient
 
 
-def _solved(
-    jumps: Discontinuities, film: Film, kind: IntArray, x: FloatArray, conditions: _Conditions
+def solve_conditions(
+    jumps: Discontinuities, film: Screen, kind: IntArray, x: FloatArray, conditions: Conditions
 ) -> BoundaryMotion:
-    """The motion of points x (n, 3) of these kinds under their conditions."""
+    """The motion of points x (n, 3) of these kinds under their conditions. Of the terms, those of
+    the first conditions come first, for all known points; then those of the second conditions."""
     g1, g2 = conditions.gradient, conditions.second_gradient
-    squares, mixed, others = (_dots(a, b) for a, b in ((g1, g1), (g1, g2), (g2, g2)))
+    squares, mixed, others = (inner_products(a, b) for a, b in ((g1, g1), (g1, g2), (g2, g2)))
     determinant = squares * others - mixed**2
     is_single = kind == int(BoundaryKind.OUTLINE)
-    is_pair = ~is_single & (determinant > _PARALLEL * squares * others)
+    is_pair = ~is_single & (determinant > PARALLEL * squares * others)
     jacobian = film.jacobian(x)
     along = np.einsum("nsi,ni->ns", jacobian, np.cross(g1, g2))
     turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -211,7 +216,7 @@ def _solved(
     with np.errstate(invalid="ignore", divide="ignore"):
         normal = np.where(is_known[:, None], normal * (side / length)[:, None], 0)
         pulled = np.einsum("ns,nsi->ni", normal, jacobian)
-        first, second = _dots(pulled, g1), _dots(pulled, g2)
+        first, second = inner_products(pulled, g1), inner_products(pulled, g2)
         # The row -pulled . G^T (G G^T)^-1; for a single condition, of g1 alone.
         paired = -(first * others - second * mixed) / determinant
         weight = np.where(is_pair, paired, -first / squares)
@@ -232,16 +237,16 @@ def _solved(
 def _sines(g: FloatArray, directions: FloatArray) -> FloatArray:
     """The sines (n,) of the angles between rays (n, 3) and level sets with gradients g (n, 3)."""
     with np.errstate(invalid="ignore"):  # normals of facets are no gradients
-        return np.abs(_dots(g, directions)) / np.linalg.norm(g, axis=1)
+        return np.abs(inner_products(g, directions)) / np.linalg.norm(g, axis=1)
 
 
-def _dots(a: FloatArray, b: FloatArray) -> FloatArray:
+def inner_products(a: FloatArray, b: FloatArray) -> FloatArray:
     """The inner products (n,) of vectors (n, 3)."""
     return (a * b).sum(axis=1)
 
 
 def _sides_of_edges(
-    jumps: Discontinuities, film: Film, surface: TracedSurface, index: IntArray,
+    jumps: Discontinuities, film: Screen, surface: TracedSurface, index: IntArray,
     is_before: BoolArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
     """Points on both sides of edges that are outlines: where rays a little farther inside enter the
@@ -253,11 +258,12 @@ def _sides_of_edges(
     inside = np.where(is_before[:, None], ends[:, 0], ends[:, 1])
     inwards = np.where(is_before, -1, 1)[:, None] * np.diff(ends, axis=1)[:, 0]
     inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
-    directions = film.directions(inside + _INSIDE * inwards)
+    film, inside = film.at(index), inside + _INSIDE * inwards
+    origins, directions = film.origins(inside), film.directions(inside)
     t = np.minimum(jumps.before.t[index], jumps.behind.t[index])
-    reach = _LONGEST_EDGE * film.pixel_width(film.origin + t[:, None] * directions)
+    reach = _LONGEST_EDGE * film.pixel_width(origins + t[:, None] * directions)
     near, far = np.maximum(t - reach, 0), t + reach
-    rays = RayBatch.of(film.origin[None], directions, near, far, "double")
+    rays = RayBatch.of(origins, directions, near, far, "double")
     crossings = crossings_to_numpy(
         trace_crossings(surface, rays, 2, differentiable=False), len(index), 2
     )
@@ -275,15 +281,15 @@ def _contact(
     There grad f . d = 0; the derivative of this along the ray is taken as a difference.
     """
     h = _DIFFERENCE * width
-    slope = _dots(g, d)
-    bend = (_dots(_gradients(tracer, x + h[:, None] * d), d) - slope) / h
+    slope = inner_products(g, d)
+    bend = (inner_products(gradients_at(tracer, x + h[:, None] * d), d) - slope) / h
     with np.errstate(invalid="ignore", divide="ignore"):
         step = -slope / bend
     step = np.where(np.abs(step) < _LONGEST_STEP * width, step, 0)
     return x + step[:, None] * d
 
 
-def _gradients(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
+def gradients_at(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
     """grad f at points (n, 3)."""
     if not len(points):
         return np.zeros((0, 3))

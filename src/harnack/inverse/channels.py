@@ -16,10 +16,11 @@ from harnack.name_suggestions import did_you_mean, with_article
 
 if TYPE_CHECKING:
     from harnack.backend import FloatArray, Real, Vec3
+    from harnack.inverse.distant_lights import DistantLights
     from harnack.inverse.film import Film
     from harnack.tracer import Hits
 
-Show = Literal["shaded", "normals", "depth", "mask"]
+Show = Literal["shaded", "path", "normals", "depth", "mask"]
 Channels = Callable[["Hits"], Sequence["Real"]]
 # The part of the light of a shaded picture that comes from all sides.
 _AMBIENT = 0.2
@@ -32,11 +33,23 @@ class ChannelFunction:
     function: from hits to the channels.
     background: the numbers of the channels where nothing is hit; a single one for all.
     is_constant: whether the channels of hits are constants.
+    lights: whose shadows the picture shows. Behind the channel that is shown, `function` returns
+        others, by which the edges of shadows are found. None for no lights.
     """
 
     function: Channels
     background: tuple[float, ...]
     is_constant: bool = False
+    lights: DistantLights | None = None
+
+    @property
+    def hidden_count(self) -> int:
+        """The number of last channels that are not shown."""
+        return 0 if self.lights is None else self.lights.hidden_count
+
+    def shown(self, color: FloatArray) -> FloatArray:
+        """The channels that are shown, of an array whose last axis counts all channels."""
+        return color[..., : color.shape[-1] - self.hidden_count]
 
     def of(self, hits: Hits, direction: Vec3) -> list[Real]:
         """The channels of rays, as Dr.Jit arrays. Where nothing is hit they are the background, and
@@ -55,16 +68,25 @@ class ChannelFunction:
         if dr.is_array_v(type(shown)):
             shown = [*shown] if dr.depth_v(type(shown)) > 1 else [shown]
         values: list[Real] = [kind(value) for value in shown]
-        background = self.background * (len(values) if len(self.background) == 1 else 1)
-        if len(background) != len(values):
+        count = len(values) - self.hidden_count
+        background = self.background * (count if len(self.background) == 1 else 1)
+        if len(background) != count:
             raise ValueError(
-                f"background has {len(background)} numbers, and the picture {len(values)} channels"
+                f"background has {len(background)} numbers, and the picture {count} channels"
             )
+        background += (0.0,) * self.hidden_count
         return [dr.select(is_hit, v, b) for v, b in zip(values, background, strict=True)]
 
 
-def channel_function(show: Any, background: Any, light: Any, film: Film) -> ChannelFunction:
-    """The channels of a picture from the arguments of `picture`.
+def channel_function(
+    show: Any,
+    background: Any,
+    light: Any,
+    film: Film,
+    lights: Callable[[FloatArray], DistantLights],
+) -> ChannelFunction:
+    """The channels of a picture from the arguments of `picture`. lights: from the direction (3,) to
+    the sun to the lights of a path-traced picture.
 
     Raises:
         TypeError, ValueError: a name that is none of `Show`, or arguments that are no numbers.
@@ -78,13 +100,16 @@ def channel_function(show: Any, background: Any, light: Any, film: Film) -> Chan
         raise TypeError(f"show is a name or a function of hits, not {kind}")
     if show == "shaded":
         return ChannelFunction(lit_by(_light_direction(light, film)), colors)
+    if show == "path":
+        lamps = lights(_light_direction(light, film))
+        return ChannelFunction(lamps.channels, colors, lights=lamps)
     functions: dict[str, Channels] = {
         "normals": lambda hits: [*hits.normal],
         "depth": lambda hits: [hits.t],
         "mask": lambda hits: [0 * dr.detach(hits.t) + 1],
     }
     if show not in functions:
-        names = ("shaded", *functions)
+        names = ("shaded", "path", *functions)
         raise ValueError(
             f"show is one of {', '.join(names)}, not {show!r}{did_you_mean(show, names)}"
         )

@@ -46,6 +46,7 @@ from harnack.inverse.discontinuities import (
 from harnack.inverse.film import has_fixed_pose, pixel_indices
 from harnack.inverse.outlines import with_exact_outlines
 from harnack.inverse.scanline_samples import scanline_samples
+from harnack.inverse.shadow_motion import with_shadow_motion
 from harnack.name_suggestions import with_article
 from harnack.tracer.derivatives import (
     change_of_nearest_level,
@@ -72,7 +73,13 @@ _FINE_TOLERANCE = 1e-3
 # A hit within the tolerance of the surface may be this many tolerances from it along its ray.
 _LONGEST_STEP = 1000.0
 # If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused.
-_MAX_UNKNOWN = 0.01
+_MAX_UNKNOWN = 0.02
+
+
+def with_fine_tolerance(surface: TracedSurface) -> TracedSurface:
+    """The surface with a small tolerance, as discontinuities, derivatives and shadows need it."""
+    tolerance = HitTolerance(_FINE_TOLERANCE * surface.hit_tolerance.distance)
+    return replace(surface, tolerance=tolerance, ray_count=0)
 
 
 @dataclass(frozen=True)
@@ -103,9 +110,9 @@ class Drawing:
         # First of all, since levels would lose their derivatives where these are suspended.
         has_derivatives = self._has_derivatives
         colors, is_hit = self._colors_on_grid()
-        image = self._averaged(colors)
+        image = self._averaged(self.channels.shown(colors))
         jumps = find_discontinuities(self.grid, is_hit, colors, self._look)
-        motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
+        motion = self._motion(jumps)
         if not self.channels.is_constant:
             jumps = with_exact_outlines(jumps, motion, self.film, self._fine_tracer, self.channels)
         pieces = np.ones(len(jumps)) if self.random is None else piece_weights(jumps, self.grid)
@@ -121,6 +128,19 @@ class Drawing:
             samples = scanline_samples(self.grid, is_hit, jumps, motion, pieces, random)
             numbers = self._with_derivatives_inside(numbers, samples)
         return dr.tensor_t(type(numbers))(numbers, (height, width, channel_count))
+
+    def _motion(self, jumps: Discontinuities) -> BoundaryMotion:
+        """How jumps move."""
+        motion = boundary_motion(jumps, self.film, self._fine_surface, self._fine_tracer)
+        if self.channels.lights is None:
+            return motion
+        return with_shadow_motion(
+            motion, jumps, self.film, self._fine_surface, self.channels.lights
+        )
+
+    def _steps(self, jumps: Discontinuities) -> FloatArray:
+        """By how much the channels (n, c) that are shown jump."""
+        return self.channels.shown(jumps.behind.color - jumps.before.color)
 
     @property
     def _has_derivatives(self) -> bool:
@@ -142,7 +162,7 @@ class Drawing:
                 "harnack.Camera(box=harnack.Box((-1, -1, -1), (1, 1, 1))), or a position, a target "
                 "and a fov"
             )
-        size = np.abs(jumps.behind.color - jumps.before.color).max(axis=1)
+        size = np.abs(self._steps(jumps)).max(axis=1)
         is_unknown = motion.kind == int(BoundaryKind.UNKNOWN)
         if size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
             raise NotImplementedError(
@@ -161,11 +181,16 @@ class Drawing:
 
     def _colors_on_grid(self) -> tuple[FloatArray, BoolArray]:
         """The channels (k, m, c) of the rays through the points of the grid, and which hit."""
-        rays = self._rays(self.grid.points, self.backend)
+        # Rays to lights begin at the surface, not within the usual tolerance of it.
+        backend = self.backend if self.channels.lights is None else self._fine_tracer.backend
+        rays = self._rays(self.grid.points, backend)
         with dr.suspend_grad():
-            many = rays.count >= MIN_RAYS_FOR_CELLS
-            tracer = self.surface.for_rays(rays.count).tracer(self.backend, many_rays=many)
+            many, tracer = rays.count >= MIN_RAYS_FOR_CELLS, self._fine_tracer
+            if self.channels.lights is None:
+                tracer = self.surface.for_rays(rays.count).tracer(backend, many_rays=many)
             hits, _ = hits_with_derivatives(tracer, rays)
+            if self.channels.lights is not None:
+                hits = self._on_level(hits, rays)
             seen = self._seen(hits, rays)
         lost = int(dr.count(hits.status == int(RayStatus.OUT_OF_STEPS))[0])
         if lost:
@@ -179,8 +204,7 @@ class Drawing:
     @functools.cached_property
     def _fine_surface(self) -> TracedSurface:
         """The surface with a small tolerance, for discontinuities and derivatives."""
-        tolerance = HitTolerance(_FINE_TOLERANCE * self.surface.hit_tolerance.distance)
-        return replace(self.surface, tolerance=tolerance, ray_count=0)
+        return with_fine_tolerance(self.surface)
 
     @functools.cached_property
     def _fine_tracer(self) -> SurfaceTracer:
@@ -190,7 +214,7 @@ class Drawing:
     def _look(self, points: FloatArray) -> Seen:
         """What rays through screen points (n, 2) see, in double precision."""
         if not len(points):
-            channel_count = len(self.channels.background)
+            channel_count = len(self.channels.background) + self.channels.hidden_count
             return Seen(
                 np.zeros(0, bool), np.zeros((0, channel_count)), np.zeros(0), np.zeros((0, 3))
             )
@@ -253,7 +277,7 @@ class Drawing:
         square = motion.normal[n, jumps.axis] ** 2
         square = np.where(motion.kind == int(BoundaryKind.UNKNOWN), 0.5, square)
         share = np.where(weights > 1, 0, length * square / parts**2)
-        step = jumps.behind.color - jumps.before.color
+        step = self._steps(jumps)
         image = np.zeros((height * width, step.shape[1]))
         np.add.at(image, pixel_indices(jumps.middle, self.film.size), share[:, None] * step)
         return image.reshape(height, width, -1)
@@ -278,7 +302,7 @@ class Drawing:
         change = change - change_of_nearest_level(tracer, sample.value)
         across = np.abs(motion.normal[np.arange(len(jumps)), jumps.axis]) / self.grid.samples
         # The boundary moves away from what is seen before it.
-        step = ((jumps.before.color - jumps.behind.color) * (across * weights)[:, None])[jump]
+        step = (-self._steps(jumps) * (across * weights)[:, None])[jump]
         pixel = pixel_indices(jumps.middle, self.film.size)[jump]
         for k in range(step.shape[1]):
             shares = change * upload_floats(tracer.backend, motion.weight * step[:, k])
@@ -299,6 +323,7 @@ class Drawing:
         rays = self._rays(samples.screen, tracer.backend)
         hits, _ = hits_with_derivatives(tracer, rays, longest_step=_LONGEST_STEP)
         colors = self.channels.of(hits, rays.direction)
+        colors = colors[: len(colors) - self.channels.hidden_count]
         if not any(map(dr.grad_enabled, colors)):
             return numbers
         with dr.suspend_grad():

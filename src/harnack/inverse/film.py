@@ -7,15 +7,41 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from harnack.rendering.camera import Camera
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from harnack.backend import FloatArray, IntArray
     from harnack.geometry import Volume
+
+
+class Screen(Protocol):
+    """Where n points of space are seen: by a camera, or, for shadows, by lights."""
+
+    def at(self, index: IntArray) -> Self:
+        """The screen for the points with these indices."""
+        ...
+
+    def directions(self, screen: FloatArray) -> FloatArray:
+        """The unit directions (n, 3) of the rays through screen points (n, 2)."""
+        ...
+
+    def origins(self, screen: FloatArray) -> FloatArray:
+        """The origins (n, 3), or (1, 3) if all are the same, of the rays through screen points."""
+        ...
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """The derivatives (n, 2, 3) of screen points by the points (n, 3) that are seen there."""
+        ...
+
+    def pixel_width(self, points: FloatArray) -> FloatArray:
+        """The length (n,) at points (n, 3) that is seen as one unit of the screen."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -61,6 +87,16 @@ class Film:
         slope = math.tan(math.radians(pose.fov) / 2) / max(size)
         right = np.cross(forward, up) * slope * size[0]
         return cls(np.array(pose.origin, float), right, up * slope * size[1], forward, size)
+
+    def at(self, index: IntArray) -> Film:
+        """This film, which is the same for all points."""
+        del index
+        return self
+
+    def origins(self, screen: FloatArray) -> FloatArray:
+        """The origin (1, 3) of all rays."""
+        del screen
+        return self.origin[None]
 
     def directions(self, screen: FloatArray) -> FloatArray:
         """The unit directions (n, 3) of the rays through screen points (n, 2)."""

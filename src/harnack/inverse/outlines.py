@@ -69,7 +69,10 @@ def with_exact_outlines(
         turn = dr.select(side > 0, -1.0, 1.0) / safe_norm(sample.gradient)
         normal = sample.gradient * turn
         distance = safe_norm(points - upload_vectors(backend, film.origin[None]))
-        shown = channels.of(_hits(points, distance, normal), direction - normal)
+        # Where the color is asked for, the contact is on the surface: shadows depend on it.
+        step = tracer.levels.offset_to_nearest(sample.value) / dr.squared_norm(sample.gradient)
+        on_surface = points + sample.gradient * dr.select(dr.isfinite(step), step, 0)
+        shown = channels.of(_hits(on_surface, distance, normal), direction - normal)
     columns = [np.broadcast_to(to_numpy(color), (len(index),)) for color in shown]
     color = np.stack(columns, axis=1).astype(np.float64)
     before, behind = jumps.before.color.copy(), jumps.behind.color.copy()

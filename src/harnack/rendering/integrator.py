@@ -28,6 +28,7 @@ import drjit as dr
 from harnack.backend.loops import active_lanes, array_leaves, broadcast_copy, gather_record
 from harnack.rendering.hybrid_scene import HybridScene, spawn_ray, spawn_ray_to
 from harnack.rendering.mitsuba import load_mitsuba, transmittance
+from harnack.rendering.mitsuba_proxy import refuse_attached_surfaces
 
 if TYPE_CHECKING:
     from harnack.backend import Mask, Real
@@ -549,8 +550,10 @@ def integrator_class(variant: str) -> Any:
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Mask = True
         ) -> tuple[Any, Mask, list[Any]]:
             """Return what Mitsuba's interface asks for: the light of camera rays, whether they hit
-            a surface, and no further channels. `medium` is ignored. Lost paths are counted."""
+            a surface, and no further channels. `medium` is ignored. Lost paths are counted.
+            Derivatives by level sets of harnack are refused."""
             del medium
+            refuse_attached_surfaces(scene)
             results = self.tracer.trace(scene, _sobol_from(mi, sampler), ray, active)
             self.lost = self.lost + dr.count(results.lost)
             return results.light, results.valid, []

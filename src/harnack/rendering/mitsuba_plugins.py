@@ -48,7 +48,12 @@ from harnack.rendering import integrator, mitsuba_proxy
 from harnack.rendering.integrator import INTEGRATOR, PLUGIN, PathTracer
 from harnack.rendering.isolines import Isolines, parse_isolines
 from harnack.rendering.mitsuba import load_dict, load_mitsuba
-from harnack.rendering.mitsuba_proxy import as_matrix, from_properties, is_proxy
+from harnack.rendering.mitsuba_proxy import (
+    as_matrix,
+    from_properties,
+    is_proxy,
+    refuse_attached_surfaces,
+)
 from harnack.tracer import Surface, TracedSurface, traced_surface
 from harnack.tracer.traced_surface import check_has_inside
 
@@ -67,7 +72,8 @@ _DIRECT, _CHANNELS = "DirectIntegrator", "AOVIntegrator"
 
 def patch_mitsuba_render(mi: Any) -> None:
     """Replace `mitsuba.render` by a function that warns of level sets of harnack that will not be
-    drawn, and then renders as before. If it has been replaced before, nothing changes."""
+    drawn, and refuses derivatives by what they are made of; and then renders as before. If it has
+    been replaced before, nothing changes."""
     original = mi.render
     if _MARK in vars(original):
         return
@@ -80,6 +86,7 @@ def patch_mitsuba_render(mi: Any) -> None:
         chosen = settings.get("integrator") or (args[2] if len(args) > 2 else None)
         if isinstance(scene, mi.Scene):
             warn_unsupported_integrator(scene, chosen or scene.integrator())
+            refuse_attached_surfaces(scene)
         return original(scene, *args, **settings)
 
     vars(render)[_MARK] = True

@@ -20,6 +20,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import upload_floats
+from harnack.backend.validation import has_derivatives
 from harnack.rendering.framing import bounding_box
 from harnack.rendering.isolines import Isolines
 from harnack.rendering.mitsuba import (
@@ -253,3 +254,19 @@ def _bsdf_holder(mi: Any, bsdf: Any) -> Any:
 def is_proxy(shape: Any) -> bool:
     """Return whether a Mitsuba shape is a proxy, a mesh that stands for a level set of harnack."""
     return isinstance(getattr(shape, "placed", None), PlacedSurface)
+
+
+def refuse_attached_surfaces(scene: Any) -> None:
+    """Check that no level set of harnack in a scene has derivatives enabled: the light of paths
+    does not carry them, and zero would be wrong.
+
+    Raises:
+        NotImplementedError: parameters of a field, or levels, have derivatives enabled.
+    """
+    for shape in scene.shapes():
+        if is_proxy(shape) and has_derivatives((shape.surface.field, shape.surface.levels)):
+            raise NotImplementedError(
+                f"pictures of Mitsuba scenes have no derivatives by the numbers of this "
+                f"{type(shape.surface.field).__name__} or by its level: detach them, as "
+                'drjit.detach does, or draw it by harnack.picture(field, show="path")'
+            )
