@@ -277,6 +277,23 @@ def test_graphs_of_pytorch_can_be_gone_back_through_again() -> None:
     assert torch.autograd.gradcheck(lambda v: hk.io.wrap_for_torch(angles)(v, points), (vertices,))
 
 
+def test_second_derivatives_in_pytorch_are_refused() -> None:
+    """Also where they are only a part: of (r t)' = t + r t' the term r t'' was left out."""
+
+    @hk.io.wrap_for_torch
+    def value(r: Any, points: Any) -> Any:
+        return hk.Sphere(r).value(points) ** 2
+
+    r = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    point = torch.tensor([[0.3, -0.2, 0.4]], dtype=torch.float64)
+    (slope,) = torch.autograd.grad((r * value(r, point)).sum(), r, create_graph=True)
+    assert slope.item() == pytest.approx(0.0385165 * (0.0385165 - 1), rel=1e-4)
+    for loss in (slope, slope + r**2):
+        with pytest.raises(NotImplementedError, match="no second derivatives"):
+            torch.autograd.grad(loss, r, retain_graph=True)
+    assert torch.autograd.grad(slope.detach() * r, r)[0] == slope
+
+
 def test_containers_and_other_arguments_are_passed_on() -> None:
     def both(points: Any, scale: float) -> Any:
         return {"twice": scale * points, "count": hk.SolidAngle(LOOP).value(points)}

@@ -152,6 +152,21 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         all_arguments = (next(remaining) if value is None else value for value in arguments)
         return inputs, function(*all_arguments)
 
+    class FirstDerivative(torch.autograd.Function):
+        """The identity for a gradient that is asked for with create_graph=True. It depends on the
+        arguments, and its own derivative is refused: PyTorch would take it for 0."""
+
+        @staticmethod
+        def forward(ctx: Any, gradient: Any, *sources: Any) -> Any:
+            """Return the gradient. sources: all that it depends on."""
+            del ctx, sources
+            return gradient.clone()
+
+        @staticmethod
+        def backward(ctx: Any, *cotangents: Any) -> Any:
+            """Raise NotImplementedError."""
+            raise NotImplementedError(_NO_SECOND_DERIVATIVE)
+
     class Wrapped(torch.autograd.Function):
         """The function in the form that PyTorch's automatic differentiation calls. `ctx` is
         PyTorch's object that keeps values from the forward pass for the backward pass."""
@@ -179,7 +194,6 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
             return results
 
         @staticmethod
-        @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *cotangents: Any) -> Any:
             """Return the gradients with respect to the arguments of `forward` (None for the first
             two). cotangents: the gradients with respect to its results.
@@ -192,12 +206,18 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
                 inputs, outputs = run_function(ctx.arguments, ctx.saved_tensors)
                 graph = inputs, _results(outputs)
             inputs, outputs = graph
-            gradients = iter(_gradients(inputs, outputs, list(cotangents)))
-            return (
-                None,
-                None,
-                *(next(gradients).torch() if dr.is_float_v(value) else None for value in inputs),
-            )
+            given = [None if value is None else value.detach() for value in cotangents]
+            parts = _gradients(inputs, outputs, given)
+            gradients = [part.torch() for part in parts]
+            if torch.is_grad_enabled():  # create_graph=True
+                sources = [
+                    *ctx.saved_tensors,
+                    *(value for value in cotangents if value is not None),
+                ]
+                gradients = [FirstDerivative.apply(part, *sources) for part in gradients]
+            remaining = iter(gradients)
+            own = (next(remaining) if dr.is_float_v(value) else None for value in inputs)
+            return None, None, *own
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
@@ -246,7 +266,7 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
             respect to any input.
     """
     for output, cotangent in zip(outputs, cotangents, strict=True):
-        if cotangent is None or not dr.is_float_v(output):
+        if cotangent is None or not dr.is_float_v(output) or not dr.width(output):
             continue
         cotangent_tensor, tensor = _import_tensor(cotangent), _as_tensor(output)
         if dr.grad_enabled(tensor):
@@ -260,6 +280,10 @@ def _gradients(inputs: list[Any], outputs: list[Any], cotangents: list[Any]) -> 
     return [dr.grad(source) for source in inputs if dr.is_float_v(source)]
 
 
+_NO_SECOND_DERIVATIVE = (
+    "wrap_for_torch gives no second derivatives: detach the gradient that create_graph=True asked "
+    "for where it is a constant"
+)
 _NO_DERIVATIVE = (
     "a result of the wrapped function depends on its arguments by nothing that has a derivative: "
     "zero would be wrong where it depends on whether rays hit (hits.is_hit, hits.status), on what "

@@ -156,6 +156,8 @@ def _distance_of_vectors(
 ) -> Real:
     """The signed distances of Dr.Jit points by their closest points, with derivatives."""
     backend = backend_of(points)
+    if not dr.width(points):  # Dr.Jit adds no number to an empty array
+        return dr.zeros(backend.Float, 0)
     x = plain_numbers(points).reshape(-1, 3)
     traced, search_backend = _surface("signed_distance", surface, options, keywords)
     field = traced.field

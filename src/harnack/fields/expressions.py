@@ -378,6 +378,13 @@ class Expression(Formula):
             }
         return self.function(x, y, z, **numbers)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A read-only view of a dictionary is not copied and not pickled.
+        return {**vars(self), "numbers": dict(self.numbers)}
+
+    def __setstate__(self, state: Any) -> None:
+        super().__setstate__({**state, "numbers": MappingProxyType(state["numbers"])})
+
     def extent(self, levels: tuple[float, ...]) -> Volume | None:
         if self.domain is not None:
             return self.domain

@@ -250,6 +250,16 @@ class Field(FieldOperators, Parametrized, abc.ABC):
             object.__setattr__(other, name, value)  # also of frozen dataclasses, and in __slots__
         return other
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """What pickle and `copy.deepcopy` make a copy of. They copy arrays without derivatives, so
+        a field that has some is refused with NotImplementedError."""
+        if has_derivatives(vars(self)):
+            raise NotImplementedError(
+                f"a pickle or deep copy of this {type(self).__name__} would lose derivatives of "
+                "its numbers: take copy.copy or replace, or detach the numbers (drjit.detach)"
+            )
+        return super().__reduce_ex__(protocol)
+
     def __setstate__(self, state: Any) -> None:
         """Restore a pickled field or a deep copy from its attributes `state`, and make its arrays
         read-only again, because NumPy does not pickle this. (They are read-only because results
@@ -343,6 +353,8 @@ class Field(FieldOperators, Parametrized, abc.ABC):
         """
         if dr.is_array_v(type(points)):
             refuse_hidden_parameters(self)
+            if not dr.width(points):  # Dr.Jit adds no number to an empty array
+                return dr.zeros(type(points[0]), 0)
             if any(dr.grad_enabled(array) for array in (points, *differentiable_parameters(self))):
                 return value_with_parameters(self, self.evaluator(backend_of(points)), points)
             return self.evaluate(points).value
@@ -365,6 +377,8 @@ class Field(FieldOperators, Parametrized, abc.ABC):
             return self._evaluate_points(points, precision, lambda sample: sample.gradient)
         refuse_hidden_parameters(self)
         parameters = differentiable_parameters(self)
+        if not dr.width(points):
+            return dr.zeros(type(points), 0)
         if not any(map(dr.grad_enabled, (points, *parameters))):
             return self.evaluate(points).gradient
         evaluator = self.evaluator(backend_of(points))

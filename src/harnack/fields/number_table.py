@@ -30,6 +30,7 @@ __all__ = [
     "NumberRecorder",
     "NumberSlice",
     "NumberTable",
+    "components_of",
     "detached",
     "is_attached_number",
     "plain_numbers",
@@ -108,7 +109,7 @@ class NumberTable:
         for array in arrays:
             if id(array) in self._places or not dr.grad_enabled(array):
                 continue
-            components = [backend.Float(component) for component in _components(array)]
+            components = [backend.Float(component) for component in components_of(array)]
             length: int = max(dr.width(component) for component in components)
             # Vectors may have a component that is the same in all lanes.
             components = [c if dr.width(c) == length else c + dr.zeros(type(c), length)
@@ -274,18 +275,24 @@ class AlikeParts:
 
 def plain_numbers(value: Any) -> FloatArray:
     """The numbers of an array, or of nested lists and tuples, with Dr.Jit numbers, without
-    derivatives. Of a vector with n lanes, (n, 3); of one with a single lane, (3,)."""
+    derivatives. Of a vector with n lanes, (n, 3); of one with a single lane, (3,). Raises
+    ValueError for entries of a list that have different shapes."""
     if isinstance(value, NumberSlice):
         return value.numbers
     if isinstance(value, tuple | list):
-        return np.array([plain_numbers(entry) for entry in cast("Sequence[Any]", value)])
+        entries = [plain_numbers(entry) for entry in cast("Sequence[Any]", value)]
+        shapes = {np.shape(entry) for entry in entries}
+        if len(shapes) > 1:
+            shown = ", ".join("x".join(map(str, shape)) or "1" for shape in sorted(shapes))
+            raise ValueError(f"of numbers in a list, all must be of one shape, not of {shown}")
+        return np.array(entries)
     kind = cast("Any", type(value))
     if not dr.is_array_v(kind):
         return np.asarray(value, np.float64)
     if dr.is_tensor_v(kind):
         return np.array(dr.detach(value), np.float64)
     # By component: to join literals, other numbers would need another kernel.
-    columns = [np.array(dr.detach(component), np.float64) for component in _components(value)]
+    columns = [np.array(dr.detach(component), np.float64) for component in components_of(value)]
     numbers = np.stack(np.broadcast_arrays(*columns), axis=-1)
     numbers = numbers[:, 0] if dr.depth_v(kind) == 1 else numbers
     return numbers[0] if len(numbers) == 1 else numbers
@@ -317,10 +324,10 @@ def _holds_arrays(value: Any) -> bool:
     return isinstance(value, NumberSlice) or dr.is_array_v(cast("Any", type(value)))
 
 
-def _components(array: Any) -> list[Any]:
+def components_of(array: Any) -> list[Any]:
     """The arrays of one dimension that a Dr.Jit array consists of."""
     if dr.is_tensor_v(array):
         return [array.array]
     if dr.depth_v(array) > 1:
-        return [inner for component in array for inner in _components(component)]
+        return [inner for component in array for inner in components_of(component)]
     return [array]

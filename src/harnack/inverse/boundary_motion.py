@@ -48,13 +48,20 @@ if TYPE_CHECKING:
 # Within so many times the accuracy of jumps on the screen, points are the same on both sides of a
 # jump, or lie on a cut or an end. On a surface under the sine s to the ray, this is divided by s.
 _SAME_POINT = 3.0
+# At creases beside an outline, s is that of the flatter side, and at least this number.
+_FLATTEST = 0.02
 # A ray may touch the surface if the sine of the angle between them is below this number. On a
 # surface with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the
 # outline: 0.03 for the 0.005 of a pixel that is left, if R is ten pixels.
 _TOUCHING = 0.1
+# The jump is then found within this part of a pixel from the outline, or the accuracy of jumps.
+_NEAR_OUTLINE = 0.005
+# On one smooth side of the surface, gradients there have at least this cosine.
+_SAME_SIDE = 0.9
 # For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
-# at most this part of the width of a pixel from the edge.
-_INSIDE, _LONGEST_EDGE = 0.02, 0.5
+# at most this part of the width of a pixel from the edge; or so many, if it leaves through a side
+# that is nearly parallel to it.
+_INSIDE, _LONGEST_EDGE, _LONGEST_ALONG = 0.005, 0.5, 4.0
 PARALLEL = 4e-4
 """Two gradients are parallel if the squared sine of their angle is below this number: 1.1
 degrees."""
@@ -129,7 +136,7 @@ def boundary_motion(
     near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
     # The two sides of a crease are apart by what the flatter one is seen to recede.
     flatter = np.fmin(sine, other_sine)
-    near_other = _SAME_POINT * resolution * width / np.maximum(flatter, _TOUCHING)
+    near_other = _SAME_POINT * resolution * width / np.maximum(flatter, _FLATTEST)
     kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
     conditions = Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
 
@@ -158,17 +165,31 @@ def boundary_motion(
         if (index := take(np.abs(depth) < near, BoundaryKind.CUT)).size:
             normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
             conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
-    if (index := take(sine < _TOUCHING, BoundaryKind.OUTLINE)).size:
+    index = np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & (sine < _TOUCHING))
+    if index.size:
         contact = _contact(tracer, x[index], g[index], directions[index], width[index])
-        conditions.set_first(index, contact, gradients_at(tracer, contact))
+        g_contact, gap = gradients_at(tracer, contact), _gaps(tracer, contact)
+        # Else the surface ends before, at an edge.
+        is_outline = _distances_on_screen(film.at(index), contact, g_contact, gap) < np.maximum(
+            _SAME_POINT * resolution[index], _NEAR_OUTLINE
+        )
+        is_outline &= _cosines(g[index], g_contact) > _SAME_SIDE
+        index, contact = index[is_outline], contact[is_outline]
+        kind[index] = int(BoundaryKind.OUTLINE)
+        conditions.set_first(index, contact, g_contact[is_outline])
         x[index] = contact
     left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size:
         first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
+        g_second = gradients_at(tracer, second)
+        length = np.linalg.norm(second - first, axis=1) / width[left]
+        is_along = _sines(g_second, directions[left]) < _TOUCHING
+        is_edge &= (length < _LONGEST_EDGE) | is_along
         index, first, second = left[is_edge], first[is_edge], second[is_edge]
         kind[index] = int(BoundaryKind.EDGE)
         conditions.set_first(index, first, gradients_at(tracer, first))
-        conditions.set_second(index, second, gradients_at(tracer, second))
+        conditions.set_second(index, second, g_second[is_edge])
+    take(sine < _TOUCHING, BoundaryKind.OUTLINE)  # at corners, where edges end in outlines
     return solve_conditions(jumps, film, kind, x, conditions)
 
 
@@ -240,6 +261,12 @@ def _sines(g: FloatArray, directions: FloatArray) -> FloatArray:
         return np.abs(inner_products(g, directions)) / np.linalg.norm(g, axis=1)
 
 
+def _cosines(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The cosines (n,) of the angles between vectors (n, 3)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return inner_products(a, b) / np.sqrt(inner_products(a, a) * inner_products(b, b))
+
+
 def inner_products(a: FloatArray, b: FloatArray) -> FloatArray:
     """The inner products (n,) of vectors (n, 3)."""
     return (a * b).sum(axis=1)
@@ -261,7 +288,7 @@ def _sides_of_edges(
     film, inside = film.at(index), inside + _INSIDE * inwards
     origins, directions = film.origins(inside), film.directions(inside)
     t = np.minimum(jumps.before.t[index], jumps.behind.t[index])
-    reach = _LONGEST_EDGE * film.pixel_width(origins + t[:, None] * directions)
+    reach = _LONGEST_ALONG * film.pixel_width(origins + t[:, None] * directions)
     near, far = np.maximum(t - reach, 0), t + reach
     rays = RayBatch.of(origins, directions, near, far, "double")
     crossings = crossings_to_numpy(
@@ -295,6 +322,23 @@ def gradients_at(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
         return np.zeros((0, 3))
     sample = tracer.sample(upload_vectors(tracer.backend, points))
     return to_numpy(sample.gradient).reshape(-1, 3)
+
+
+def _gaps(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
+    """|f - level| at points (n, 3), with the nearest level."""
+    value = tracer.sample(upload_vectors(tracer.backend, points)).value
+    return np.abs(to_numpy(tracer.levels.offset_to_nearest(value)))
+
+
+def _distances_on_screen(film: Screen, x: FloatArray, g: FloatArray, gap: FloatArray) -> FloatArray:
+    """The distances (n,) on the screen, to first order, from the outlines of level sets through
+    points x (n, 3), at which rays touch them, to that of the level.
+
+    g: (n, 3) grad f. gap: (n,) |f - level|.
+    """
+    across = np.linalg.norm(np.einsum("nsi,ni->ns", film.jacobian(x), g), axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return across * gap / inner_products(g, g)
 
 
 def _closest_on_curves(tracer: SurfaceTracer, x: FloatArray) -> FloatArray | None:

@@ -3,6 +3,7 @@ ray."""
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import drjit as dr
 import numpy as np
 
-from harnack.backend.validation import as_real
+from harnack.backend.validation import as_real, has_derivatives
 from harnack.geometry.volume import as_point
 from harnack.name_suggestions import did_you_mean, with_article
 
@@ -35,12 +36,14 @@ class ChannelFunction:
     is_constant: whether the channels of hits are constants.
     lights: whose shadows the picture shows. Behind the channel that is shown, `function` returns
         others, by which the edges of shadows are found. None for no lights.
+    has_derivatives: whether the function uses numbers that have derivatives.
     """
 
     function: Channels
     background: tuple[float, ...]
     is_constant: bool = False
     lights: DistantLights | None = None
+    has_derivatives: bool = False
 
     @property
     def hidden_count(self) -> int:
@@ -63,11 +66,7 @@ class ChannelFunction:
             position=dr.select(is_hit, hits.position, direction),
             normal=normal * dr.select(dr.dot(dr.detach(normal), direction) > 0, -1, 1),
         )
-        shown: Any = self.function(hits)
-        kind = cast("Any", type(hits.t))
-        if dr.is_array_v(type(shown)):
-            shown = [*shown] if dr.depth_v(type(shown)) > 1 else [shown]
-        values: list[Real] = [kind(value) for value in shown]
+        values = _as_channels(self.function(hits), cast("Any", type(hits.t)))
         count = len(values) - self.hidden_count
         background = self.background * (count if len(self.background) == 1 else 1)
         if len(background) != count:
@@ -76,6 +75,37 @@ class ChannelFunction:
             )
         background += (0.0,) * self.hidden_count
         return [dr.select(is_hit, v, b) for v, b in zip(values, background, strict=True)]
+
+
+def _as_channels(shown: Any, kind: Any) -> list[Real]:
+    """What a function of hits returned, as a list of Dr.Jit arrays of a type.
+
+    Raises:
+        TypeError: it is no Dr.Jit array or vector, number, or list of arrays and numbers. NumPy
+            arrays would have lost their derivatives.
+        ValueError: an empty list.
+    """
+    is_vector = (
+        dr.is_array_v(type(shown))
+        and not dr.is_tensor_v(type(shown))
+        and dr.depth_v(type(shown)) > 1
+    )
+    is_list = is_vector or isinstance(shown, list | tuple)
+    entries: list[Any] = [*shown] if is_list else [shown]
+    # A number of PyTorch times an array is a tensor.
+    entries = [
+        entry.array if dr.is_tensor_v(cast("Any", type(entry))) else entry for entry in entries
+    ]
+    for entry in entries:
+        is_array = dr.is_array_v(cast("Any", type(entry))) and dr.depth_v(type(entry)) == 1
+        if not is_array and not isinstance(entry, numbers.Real | np.bool_):
+            raise TypeError(
+                "show returns a Dr.Jit array or vector, or a list of arrays and numbers, not "
+                f"{with_article(type(entry).__name__)}"
+            )
+    if not entries:
+        raise ValueError("show returns no channels: an empty list")
+    return [kind(entry) for entry in entries]
 
 
 def channel_function(
@@ -91,10 +121,11 @@ def channel_function(
     Raises:
         TypeError, ValueError: a name that is none of `Show`, or arguments that are no numbers.
     """
-    numbers = np.ravel(background).tolist()
-    colors = tuple(as_real(number, "background") for number in numbers)
+    given = np.ravel(background).tolist()
+    colors = tuple(as_real(number, "background") for number in given)
     if callable(show):
-        return ChannelFunction(cast("Any", show), colors)
+        has_own = has_derivatives(show)
+        return ChannelFunction(cast("Any", show), colors, has_derivatives=has_own)
     if not isinstance(show, str):
         kind = with_article(type(show).__name__)
         raise TypeError(f"show is a name or a function of hits, not {kind}")

@@ -35,6 +35,9 @@ from harnack.backend import choose_backend, to_numpy
 from harnack.backend.arrays import upload_floats, upload_integers, upload_vectors
 from harnack.backend.elementary import max_norm, safe_norm
 from harnack.enclosures.samples import value_error_bound
+from harnack.fields.attached_numbers import refuse_moving_domain
+from harnack.fields.number_table import components_of
+from harnack.fields.parameters import differentiable_parameters
 from harnack.inverse.boundary_motion import BoundaryKind, BoundaryMotion, boundary_motion
 from harnack.inverse.discontinuities import (
     Discontinuities,
@@ -72,8 +75,9 @@ if TYPE_CHECKING:
 _FINE_TOLERANCE = 1e-3
 # A hit within the tolerance of the surface may be this many tolerances from it along its ray.
 _LONGEST_STEP = 1000.0
-# If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused.
-_MAX_UNKNOWN = 0.02
+# If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused,
+# unless these are so few: at the tips of edges.
+_MAX_UNKNOWN, _FEW_UNKNOWN = 0.02, 2
 
 
 def with_fine_tolerance(surface: TracedSurface) -> TracedSurface:
@@ -122,7 +126,9 @@ class Drawing:
         numbers = upload_floats(self.backend, image.ravel().astype(self.backend.dtype))
         if has_derivatives:
             self._check_derivatives(jumps, motion)
-            numbers = self._with_boundary_derivatives(numbers, jumps, motion, weights)
+            numbers = numbers + self._zero_of_parameters()
+            if self._surface_moves:
+                numbers = self._with_boundary_derivatives(numbers, jumps, motion, weights)
         if has_derivatives and not self.channels.is_constant:
             random = self.random or np.random.default_rng(0)
             samples = scanline_samples(self.grid, is_hit, jumps, motion, pieces, random)
@@ -144,9 +150,27 @@ class Drawing:
 
     @property
     def _has_derivatives(self) -> bool:
+        """Whether parameters of the field, levels or colors have derivatives enabled."""
+        return self._surface_moves or self.channels.has_derivatives
+
+    @functools.cached_property
+    def _surface_moves(self) -> bool:
         """Whether parameters of the field or levels have derivatives enabled."""
         zero = self.backend.Array3f(0)
         return needs_derivatives(self._fine_tracer, zero, zero)
+
+    def _zero_of_parameters(self) -> Real:
+        """The number 0, with the derivative 0 by all parameters and levels, on which a picture
+        depends also where it shows nothing of the surface."""
+        kind, index = self.backend.Float, self.backend.UInt32(0)
+        never, zero = dr.opaque(self.backend.Bool, False), kind(0)
+        sources = [*differentiable_parameters(self.surface.field), *self.surface.levels]
+        for source in sources:
+            if dr.grad_enabled(source):
+                for component in components_of(source):
+                    first = dr.gather(type(component), component, index)
+                    zero = zero + dr.select(never, kind(first), 0)
+        return zero
 
     def _check_derivatives(self, jumps: Discontinuities, motion: BoundaryMotion) -> None:
         """Raise an error if the picture's derivatives are not known."""
@@ -156,20 +180,37 @@ class Drawing:
                 f"pictures of {with_article(type(field).__name__)} have no derivatives, since its "
                 "surface is made of facets or patches: detach its level and parameters"
             )
-        if not has_fixed_pose(self.camera):
+        if self._surface_moves and not has_fixed_pose(self.camera):
             raise ValueError(
                 "the camera moves with the surface, which has no derivative: give it a box, as "
                 "harnack.Camera(box=harnack.Box((-1, -1, -1), (1, 1, 1))), or a position, a target "
                 "and a fov"
             )
+        self._check_domain(jumps.at(motion.kind == int(BoundaryKind.CUT)))
         size = np.abs(self._steps(jumps)).max(axis=1)
         is_unknown = motion.kind == int(BoundaryKind.UNKNOWN)
-        if size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
+        is_many = is_unknown.sum() > _FEW_UNKNOWN
+        if is_many and size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
             raise NotImplementedError(
                 f"{is_unknown.sum()} of {len(jumps)} points at which the picture jumps belong to "
                 "no known kind of boundary, so it is not known how they move; a function `show` "
                 "must not jump where the surface is smooth"
             )
+
+    def _check_domain(self, cuts: Discontinuities) -> None:
+        """Raise NotImplementedError if the domain of the field cuts the surface and moves with a
+        number that has derivatives. cuts: the points of cuts."""
+        domain, clip = self.surface.field.domain, self.surface.clip_volume
+        if domain is None or not len(cuts):
+            return
+        is_front = (cuts.before.t <= cuts.behind.t)[:, None]
+        points = np.where(is_front, cuts.before.position, cuts.behind.position)
+        x = upload_vectors(self._fine_tracer.backend, points)
+        is_own = clip is None or to_numpy(
+            dr.abs(domain.signed_distance(x)) <= dr.abs(clip.signed_distance(x))
+        )
+        if np.any(is_own):
+            refuse_moving_domain(self.surface.field)
 
     # Colors.
 
@@ -229,6 +270,10 @@ class Drawing:
         boundary = self._fine_tracer.field.boundary
         if boundary is None or boundary.closest_point is None:
             return hits
+        return self._moved_to_level(hits, rays)
+
+    def _moved_to_level(self, hits: Hits, rays: RayBatch) -> Hits:
+        """The hits of rays, moved from within the tolerance onto the level."""
         tracer, is_hit = self._fine_tracer, hits.is_hit
         _, t, x, sample = hits_on_level(
             tracer, rays.origin, rays.direction, hits.t, is_hit, longest_step=_LONGEST_STEP
@@ -322,6 +367,8 @@ class Drawing:
             return numbers
         rays = self._rays(samples.screen, tracer.backend)
         hits, _ = hits_with_derivatives(tracer, rays, longest_step=_LONGEST_STEP)
+        if not self._surface_moves:  # only derivatives need hits on the level
+            hits = self._moved_to_level(hits, rays)
         colors = self.channels.of(hits, rays.direction)
         colors = colors[: len(colors) - self.channels.hidden_count]
         if not any(map(dr.grad_enabled, colors)):

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from harnack.backend import backend_of, choose_backend, to_numpy
-from harnack.backend.validation import as_integer_in_range, check_no_derivatives
+from harnack.backend.validation import as_integer_in_range, check_no_derivatives, has_derivatives
 from harnack.inverse.channels import Show, channel_function
 from harnack.inverse.distant_lights import DistantLights
 from harnack.inverse.drawing import Drawing, with_fine_tolerance
@@ -81,7 +81,8 @@ def picture(
 
     Returns a Dr.Jit tensor, of the precision of the parameters, if parameters of the field or the
     level are Dr.Jit arrays, as within functions for PyTorch and JAX (`harnack.io.wrap_for_torch`);
-    else a NumPy array. Derivatives by these parameters have all of: changes of hits and normals,
+    in double precision, if only numbers that a function `show` uses have derivatives; else a NumPy
+    array. Derivatives by these parameters have all of: changes of hits and normals,
     and motions of outlines, of edges of solids, of the curves at which level sets end, of the
     curves at which `clip` or the domain cuts the surface, and of the edges of shadows, each found
     by bisection with proved first hits. Their mean over `seed` is the derivative of the mean
@@ -89,10 +90,12 @@ def picture(
     distance of the rays; and jumps of the color by less than 0.4 percent of its range.
 
     Raises:
-        TypeError, ValueError: arguments of the wrong kind or size; a surface without bounds seen by
-            a camera that needs them; derivatives with a camera whose frame follows the surface.
+        TypeError, ValueError: arguments or channels of the wrong kind or size; a surface without
+            bounds seen by a camera that needs them; derivatives with a camera whose frame follows
+            the surface.
         NotImplementedError: derivatives of fields with facets or patches; by parameters that have
-            none (`trace`); where more than 2 percent of the length of boundaries is of an unknown
+            none (`trace`), or that move a domain which cuts the surface in the picture; where more
+            than two jumps, and more than 2 percent of the length of boundaries, are of an unknown
             kind, such as where the color itself jumps on the surface.
 
     Warns if rays ran out of steps; these show the background.
@@ -112,7 +115,9 @@ def picture(
     target, choices = surface_and_options("picture", surface, options, keywords, _HONORED)
     traced = TracedSurface.of(target, choices).with_call_cache()
     backend = _backend_of_numbers(traced)
-    if backend is not None and choices.precision not in (None, backend.precision):
+    if backend is None and callable(show) and has_derivatives(show):
+        backend = choose_backend(choices.precision or "double")
+    elif backend is not None and choices.precision not in (None, backend.precision):
         raise ValueError(
             f"the parameters are in {backend.precision} precision, and so is the picture; give "
             "precision only with numbers of Python or NumPy"

@@ -127,7 +127,10 @@ class Hits:
     @property
     def is_hit(self) -> Any:
         """(n,) mask of rays that hit."""
-        return self.status == int(RayStatus.HIT)
+        status, hit = self.status, int(RayStatus.HIT)
+        if is_tensor(status) and status.shape == (0,):  # not compared with numbers by Dr.Jit
+            return dr.zeros(dr.mask_t(type(status)), (0,))
+        return status == hit
 
     if not TYPE_CHECKING:
 

@@ -166,8 +166,13 @@ def intersection_of(volumes: Sequence[Volume | None]) -> Volume | None:
 
 def level_number(level: Any) -> float:
     """Return a level, which may be a Dr.Jit number, as a Python float. Raises TypeError for a level
-    that is no number."""
+    that is no number, and ValueError for a Dr.Jit array of several."""
     if dr.is_array_v(type(level)):
+        if dr.depth_v(level) != 1 or dr.width(level) != 1:
+            raise ValueError(
+                "a level is one number, and not an array of several: give these as a list or a "
+                "tensor, [0.1, 0.2]"
+            )
         return float(dr.detach(level)[0])
     return as_number(level, "level must be a number, or several, such as 0.5 or 2 * math.pi")
 

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax, fmin
-from harnack.backend.validation import as_real, as_triple, check_no_derivatives
+from harnack.backend.validation import as_real, as_triple, check_no_derivatives, has_derivatives
 from harnack.enclosures import HarmonicBall, Lipschitz, TaylorRemainder
 from harnack.fields.analytic.rounding import WaveRounding
 from harnack.fields.analytic.waves import (
@@ -216,6 +216,13 @@ _ROUNDING = 1e-5
 _SLOPE_SHARE = 1e-5
 
 
+def _moves(term: Term) -> bool:
+    """Whether the wavelength of a term has derivatives."""
+    if isinstance(term, PlaneWave):
+        return has_derivatives(term.wave_vector)
+    return any(has_derivatives(factor.frequency) for _, factor in term.factors)
+
+
 class EigenfunctionSum(Field):
     """A sum f of products of sines and cosines, and of plane waves: any truncated Fourier series.
     Each term f_i is an eigenfunction of the Laplacian with the eigenvalue -kappa_i^2, so
@@ -265,6 +272,8 @@ class EigenfunctionSum(Field):
         longest = 2 * math.pi / min(self.waves.wavenumbers)
         min_wavelength = mean_wavelength(self.waves.amplitudes, self.waves.wavenumbers)
         self.traits = dataclasses.replace(self.traits, min_wavelength=min_wavelength)
+        if domain is None and any(map(_moves, listed)):
+            self.domain_moves = True
         self.domain = Ball(radius=longest) if domain is None else domain
         self._extension = ExtensionBounds.with_best_radius(self.waves)
         self._rounding = WaveRounding.of(self.terms)

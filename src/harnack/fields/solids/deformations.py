@@ -26,7 +26,7 @@ from harnack.fields.attached_numbers import attached, own_formula
 from harnack.fields.evaluator import POINTS, Plan
 from harnack.fields.formula import probe_jets, with_device_numbers
 from harnack.fields.formula_evaluator import FormulaEvaluator, FormulaFunction
-from harnack.fields.number_table import is_attached_number, plain_numbers
+from harnack.fields.number_table import detached, is_attached_number
 from harnack.fields.parameters import Parametrized
 from harnack.fields.solids.solid import (
     AXES,
@@ -314,8 +314,10 @@ class Taper(Deformation):
         pairs = {"start": self.start, "end": self.end}
         given = {name: end for name, end in pairs.items() if is_attached_number(end, "a taper")}
         object.__setattr__(self, "_given_numbers", given)
-        for name, value in given.items():
-            object.__setattr__(self, name, tuple(plain_numbers(value).tolist()))
+        for name, value in pairs.items():
+            plain = detached(value)
+            if plain is not value and np.ndim(plain) == 1:
+                object.__setattr__(self, name, tuple(plain.tolist()))
         try:
             ends = (*self.start, *self.end)
         except TypeError:

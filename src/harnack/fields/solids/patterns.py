@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from harnack.backend.validation import as_finite, as_real_array, check_finite
-from harnack.fields.number_table import NumberSlice, is_attached_number, plain_numbers
+from harnack.fields.number_table import NumberSlice, detached, is_attached_number
 from harnack.fields.solids.booleans import union
 from harnack.fields.solids.solid import axis_index
 from harnack.fields.solids.transforms import AffineMap
@@ -39,7 +39,7 @@ def maps_of(transforms: npt.ArrayLike) -> list[AffineMap]:
     """
     name = "the transforms of an arrangement"
     is_attached = is_attached_number(transforms, name)
-    plain: Any = plain_numbers(transforms) if is_attached else transforms
+    plain: Any = detached(transforms)
     array = np.array(as_real_array(plain, name), dtype=np.float64)
     shape = array.shape
     is_vectors = len(shape) == 2 and shape[1] == 3
@@ -74,7 +74,7 @@ def translations_of(period: Any, counts: Any) -> list[AffineMap]:
             counts that are not positive integers.
     """
     is_attached = is_attached_number(period, "the period")
-    vectors = _period_vectors(plain_numbers(period) if is_attached else period)
+    vectors = _period_vectors(detached(period))
     numbers = checked_counts(counts)
     for k, (vector, count) in enumerate(zip(vectors, numbers, strict=True)):
         if count > 1 and not vector.any():
@@ -112,10 +112,10 @@ def checked_counts(counts: Any) -> tuple[int, int, int]:
     Raises:
         ValueError: other numbers.
     """
-    entries: tuple[Any, ...] = (counts,) * 3 if np.ndim(counts) == 0 else tuple(counts)
     try:
+        entries: tuple[Any, ...] = (counts,) * 3 if np.ndim(counts) == 0 else tuple(counts)
         numbers = [operator.index(entry) for entry in entries]
-    except TypeError:
+    except (TypeError, ValueError):  # lists of several lengths, such as one with a Dr.Jit array
         numbers = []
     if len(numbers) != 3 or min(numbers) < 1:
         raise ValueError(f"counts must be one or three positive integers, not {counts!r}")
@@ -126,7 +126,7 @@ def mirror_image(solid: Solid, normal: str | Sequence[float], offset: float) -> 
     """The mirror image of a solid at the plane n . x = offset, where n is the unit vector along
     `normal` (`Solid.mirrored`)."""
     is_attached = is_attached_number((normal, offset), "a mirror")
-    plain: Any = plain_numbers(normal) if is_attached and not isinstance(normal, str) else normal
+    plain: Any = detached(normal)
     unit = _unit_vector(plain)
     distance = as_finite(offset, "the offset of the mirror")
     change = AffineMap.reflection(unit, distance)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from harnack.backend.validation import as_positive
+from harnack.backend.validation import as_positive, as_real
 from harnack.fields.capabilities import VariableAccuracy
 from harnack.fields.evaluator import Evaluator, Plan
 from harnack.fields.field import Field, Traits
@@ -309,7 +309,8 @@ class Solid(Field):
         degrees for each unit of length along the axis."""
         from harnack.fields.solids.deformations import Twist
 
-        is_attached_number(rate, "the rate of a twist")  # raises an error for others
+        if not is_attached_number(rate, "the rate of a twist"):  # raises an error for others
+            rate = as_real(rate, "the rate of a twist")
         return self._apply_map(Twist(rate * (math.pi / 180), axis))
 
     def tapered(

@@ -117,7 +117,7 @@ class AffineMap(SpaceMap, Parametrized):
         if is_attached_number(matrix, "a map of space"):
             own = _AttachedNumbers({"of": matrix}, _inverse_of_matrix)
             return replace(cls.of_matrix(own.values["of"]), attached=own)
-        m = np.asarray(matrix, dtype=np.float64)
+        m = np.asarray(detached(matrix), dtype=np.float64)
         if m.shape == (4, 4):
             if not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0)):
                 raise ValueError(f"the last row of a (4, 4) map must be (0, 0, 0, 1), not {m[3]}")
@@ -134,6 +134,7 @@ class AffineMap(SpaceMap, Parametrized):
             return replace(
                 plain, attached=_AttachedNumbers({"moved": offset}, _inverse_translation)
             )
+        offset = detached(offset)
         if np.shape(offset) != (3,):
             raise ValueError(f"offset (3,): give a vector (x, y, z), not {offset!r}")
         return cls.of_arrays(np.eye(3), np.asarray(offset, dtype=np.float64))
@@ -189,7 +190,7 @@ class AffineMap(SpaceMap, Parametrized):
         if is_attached_number(factors, "a scaling"):
             own = _AttachedNumbers({"scaled": factors}, _inverse_scaling)
             return replace(cls.scaling(cast("Any", np.squeeze(own.values["scaled"]))), attached=own)
-        sizes = np.asarray(factors, dtype=np.float64)
+        sizes = np.asarray(detached(factors), dtype=np.float64)
         # Any other shape becomes NaN, which is refused below.
         sizes = np.broadcast_to(sizes if sizes.shape in ((), (3,)) else np.nan, (3,))
         if not (np.isfinite(sizes).all() and (sizes > 0).all()):
