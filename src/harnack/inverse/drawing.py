@@ -62,7 +62,7 @@ from harnack.tracer.level_contact import HitTolerance, RayStatus
 from harnack.tracer.rays import RayBatch
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, BoolArray, FloatArray, Real
+    from harnack.backend import Backend, BoolArray, FloatArray, IntArray, Real
     from harnack.inverse.channels import ChannelFunction
     from harnack.inverse.film import Film, Grid
     from harnack.inverse.scanline_samples import ScanlineSamples
@@ -78,6 +78,8 @@ _LONGEST_STEP = 1000.0
 # If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused,
 # unless these are so few: at the tips of edges.
 _MAX_UNKNOWN, _FEW_UNKNOWN = 0.02, 2
+# A warning says if more than this part of the surface that is seen has no derivative.
+_MOST_LEFT_OUT = 0.05
 
 
 def with_fine_tolerance(surface: TracedSurface) -> TracedSurface:
@@ -267,8 +269,9 @@ class Drawing:
     def _on_level(self, hits: Hits, rays: RayBatch) -> Hits:
         """The hits of rays, moved from within the tolerance onto the level: near the curves at
         which level sets end, normals depend on it. Hits on facets and patches are exact already."""
-        boundary = self._fine_tracer.field.boundary
-        if boundary is None or boundary.closest_point is None:
+        field = self._fine_tracer.field
+        is_exact = field.traits.has_jumps or field.traits.has_patches
+        if is_exact or field.boundary is None or field.boundary.closest_point is None:
             return hits
         return self._moved_to_level(hits, rays)
 
@@ -378,7 +381,9 @@ class Drawing:
             sample = tracer.sample(point)
             error = value_error_bound(sample, safe_norm(sample.gradient), max_norm(point))
             gap = dr.abs(tracer.levels.offset_to_nearest(sample.value))
-            index = np.flatnonzero(to_numpy(hits.is_hit & (gap <= 2 * error)))
+            is_hit = to_numpy(hits.is_hit)
+            index = np.flatnonzero(is_hit & to_numpy(gap <= 2 * error))
+            _warn_of_share_left_out(samples.length, is_hit, index)
             point, normal = (to_numpy(v).reshape(-1, 3)[index] for v in (point, hits.normal))
         # The share of horizontal or vertical scanlines.
         image = np.einsum("nsi,ni->ns", self.film.jacobian(point), normal)
@@ -394,6 +399,21 @@ class Drawing:
                 shares = dr.select(weights > 0, (color - dr.detach(color)) * weights, 0)
                 numbers = _added_at(backend, numbers, shares, target)
         return numbers
+
+
+def _warn_of_share_left_out(lengths: FloatArray, is_hit: BoolArray, index: IntArray) -> None:
+    """Warn if much of the surface that is seen has no derivative.
+
+    lengths: (n,) the lengths for which rays stand.
+    is_hit, index: (n,) which hit, and (k,) those of them that reached the level.
+    """
+    left_out = 1 - lengths[index].sum() / max(lengths[is_hit].sum(), np.finfo(float).tiny)
+    if is_hit.any() and left_out > _MOST_LEFT_OUT:
+        warnings.warn(
+            f"derivatives of this picture lack {100 * left_out:.0f} percent of the surface that is "
+            "seen: hits there do not reach the level up to rounding",
+            stacklevel=5,
+        )
 
 
 def _added_at(backend: Backend, numbers: Real, shares: Real, index: Any) -> Real:
