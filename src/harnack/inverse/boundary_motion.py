@@ -51,7 +51,8 @@ _SAME_POINT = 3.0
 # A ray may touch the surface if the sine of the angle between them is below this number. On a
 # surface with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the
 # outline: 0.03 for the 0.005 of a pixel that is left, if R is ten pixels.
-_TOUCHING = 0.1
+# Below the second number, it does if Newton's method finds a contact beside the hit.
+_TOUCHING, _BEND = 0.1, 0.6
 # For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
 # at most this part of the width of a pixel from the edge.
 _INSIDE, _LONGEST_EDGE = 0.02, 0.5
@@ -161,6 +162,17 @@ def boundary_motion(
     if (index := take(sine < _TOUCHING, BoundaryKind.OUTLINE)).size:
         contact = _contact(tracer, x[index], g[index], directions[index], width[index])
         conditions.set_first(index, contact, gradients_at(tracer, contact))
+        x[index] = contact
+    # Outlines that bend within a few pixels: rays beside them do not yet nearly touch the surface.
+    if (left := np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & (sine < _BEND))).size:
+        contact = _contact(tracer, x[left], g[left], directions[left], width[left])
+        gradient = gradients_at(tracer, contact)
+        away = np.abs(_values_off_level(tracer, contact)) / np.linalg.norm(gradient, axis=1)
+        is_contact = _sines(gradient, directions[left]) < _TOUCHING / 2
+        is_contact &= away < _SAME_POINT * (resolution * width)[left]
+        index, contact = left[is_contact], contact[is_contact]
+        kind[index] = int(BoundaryKind.OUTLINE)
+        conditions.set_first(index, contact, gradient[is_contact])
         x[index] = contact
     left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size:
@@ -295,6 +307,12 @@ def gradients_at(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
         return np.zeros((0, 3))
     sample = tracer.sample(upload_vectors(tracer.backend, points))
     return to_numpy(sample.gradient).reshape(-1, 3)
+
+
+def _values_off_level(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
+    """The level less f at points (n, 3)."""
+    sample = tracer.sample(upload_vectors(tracer.backend, points))
+    return to_numpy(tracer.levels.offset_to_nearest(sample.value))
 
 
 def _closest_on_curves(tracer: SurfaceTracer, x: FloatArray) -> FloatArray | None:

@@ -72,8 +72,10 @@ if TYPE_CHECKING:
 _FINE_TOLERANCE = 1e-3
 # A hit within the tolerance of the surface may be this many tolerances from it along its ray.
 _LONGEST_STEP = 1000.0
-# If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused.
-_MAX_UNKNOWN = 0.02
+# If more than this part of the jumps of a picture is of an unknown kind, and more than so many
+# jumps of the mean size, derivatives are refused. (Where one outline passes behind another, a point
+# may be of neither.)
+_MAX_UNKNOWN, _FEW_UNKNOWN = 0.02, 4
 
 
 def with_fine_tolerance(surface: TracedSurface) -> TracedSurface:
@@ -164,7 +166,8 @@ class Drawing:
             )
         size = np.abs(self._steps(jumps)).max(axis=1)
         is_unknown = motion.kind == int(BoundaryKind.UNKNOWN)
-        if size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
+        few = max(_MAX_UNKNOWN, _FEW_UNKNOWN / max(len(jumps), 1))
+        if size[is_unknown].sum() > few * size.sum():
             raise NotImplementedError(
                 f"{is_unknown.sum()} of {len(jumps)} points at which the picture jumps belong to "
                 "no known kind of boundary, so it is not known how they move; a function `show` "
