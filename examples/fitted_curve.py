@@ -11,13 +11,13 @@ The row of pictures needs Pillow, which is in `pip install 'harnack[film]'`.
 import sys
 from pathlib import Path
 
+import harnack as hk  # isort: skip; it has Dr.Jit load its LLVM
+
 import drjit as dr
 import numpy as np
 from drjit.auto.ad import TensorXf64
 from PIL import Image
 from scipy.spatial import cKDTree
-
-import harnack as hk
 
 CAMERAS = [
     hk.Camera(position=place, target=(0, 0, 0), fov=40)
@@ -71,7 +71,7 @@ def mean_distance(first: np.ndarray, second: np.ndarray) -> float:
     return float(max(both) / np.ptp(second, axis=0).max())
 
 
-def main(folder: Path, size: tuple[int, int] = (320, 240), steps: int = 200, n: int = 32) -> float:
+def main(folder: Path, size: tuple[int, int] = (320, 240), steps: int = 100, n: int = 32) -> float:
     t = 2 * np.pi * np.arange(n) / n
     radius = 1 + 0.25 * np.cos(3 * t)
     height = 0.35 * np.sin(2 * t) + 0.1 * np.cos(3 * t)
@@ -85,7 +85,7 @@ def main(folder: Path, size: tuple[int, int] = (320, 240), steps: int = 200, n: 
     strip = [
         hk.render(
             hk.SolidAngle(curve), show="shaded", boundary_radius=0.03, size=size,
-            camera=hk.Camera(position=(2.2, -2.2, 2), target=(0, 0, 0), fov=40),
+            camera=hk.Camera(position=(2.4, -2.4, 2.4), target=(0, 0, 0), fov=46),
         )
         for curve in shown
     ]  # fmt: skip

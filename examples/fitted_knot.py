@@ -10,12 +10,13 @@ The row of pictures needs Pillow, which is in `pip install 'harnack[film]'`.
 import sys
 from pathlib import Path
 
+import harnack as hk  # isort: skip; it has Dr.Jit load its LLVM
+
 import drjit as dr
 import numpy as np
 from drjit.auto.ad import TensorXf64
 from PIL import Image
-
-import harnack as hk
+from scipy.spatial import cKDTree
 
 
 def directions(n: int) -> np.ndarray:
@@ -114,7 +115,11 @@ def main(
     Image.fromarray(np.hstack([one.srgb[..., :3] for one in strip])).save(
         folder / "fitted_knot.png"
     )
-    away = np.linalg.norm(curves[-1][:, None] - target, axis=2).min(axis=0).mean()
+    steps_between = np.arange(40)[:, None] / 40
+    fine = [
+        p + steps_between * (q - p) for p, q in zip(target, np.roll(target, -1, 0), strict=True)
+    ]
+    away = cKDTree(np.concatenate(fine)).query(curves[-1])[0].mean()
     determinant, error = knot_determinant(curves[-1]), float(away / np.ptp(target, axis=0).max())
     print(f"determinant {determinant}; vertices are {100 * error:.2f} % of the size away")
     return determinant, error

@@ -10,13 +10,13 @@ The row of pictures needs Pillow, which is in `pip install 'harnack[film]'`.
 import sys
 from pathlib import Path
 
+import harnack as hk  # isort: skip; it has Dr.Jit load its LLVM
+
 import drjit as dr
 import numpy as np
 from drjit.auto.ad import TensorXf64
 from PIL import Image
 from scipy.spatial import cKDTree
-
-import harnack as hk
 
 SMOOTHING, LEVEL, RADIUS = 0.1, 2 * np.pi, 0.6
 

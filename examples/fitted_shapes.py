@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import harnack as hk  # isort: skip; it has Dr.Jit load its LLVM
+
 import drjit as dr
 import numpy as np
 from drjit.auto.ad import TensorXf64
 from PIL import Image
-
-import harnack as hk
 
 Y = [hk.SphericalHarmonic(degree, m) for degree in (1, 2) for m in range(-degree, degree + 1)]
 

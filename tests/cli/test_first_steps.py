@@ -289,7 +289,7 @@ def test_examples_are_listed_with_what_they_need(
     assert code == 0
     assert re.search(r"^film.py +A film of all .* curve \(needs harnack\[film\]\)$", said, re.M)
     assert re.search(r"^printed_parts.py .* \(needs harnack\[outlines\]\)$", said, re.M)
-    assert said.count("needs") == 2
+    assert said.count("needs") == 6
     assert list(tmp_path.iterdir()) == []
 
 

@@ -53,7 +53,8 @@ _FLATTEST = 0.02
 # A ray may touch the surface if the sine of the angle between them is below this number. On a
 # surface with the radius of curvature R, the sine is (2 e/R)^(1/2) at the distance e from the
 # outline: 0.03 for the 0.005 of a pixel that is left, if R is ten pixels.
-_TOUCHING = 0.1
+# Below the second number, it does if Newton's method finds a contact beside the hit.
+_TOUCHING, _BEND = 0.1, 0.6
 # The jump is then found within this part of a pixel from the outline, or the accuracy of jumps.
 _NEAR_OUTLINE = 0.005
 # On one smooth side of the surface, gradients there have at least this cosine.
@@ -177,6 +178,17 @@ def boundary_motion(
         index, contact = index[is_outline], contact[is_outline]
         kind[index] = int(BoundaryKind.OUTLINE)
         conditions.set_first(index, contact, g_contact[is_outline])
+        x[index] = contact
+    # Outlines that bend within a few pixels: rays beside them do not yet nearly touch the surface.
+    if (left := np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & (sine < _BEND))).size:
+        contact = _contact(tracer, x[left], g[left], directions[left], width[left])
+        gradient = gradients_at(tracer, contact)
+        away = _gaps(tracer, contact) / np.linalg.norm(gradient, axis=1)
+        is_contact = _sines(gradient, directions[left]) < _TOUCHING / 2
+        is_contact &= away < _SAME_POINT * (resolution * width)[left]
+        index, contact = left[is_contact], contact[is_contact]
+        kind[index] = int(BoundaryKind.OUTLINE)
+        conditions.set_first(index, contact, gradient[is_contact])
         x[index] = contact
     left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
     if left.size:

@@ -75,11 +75,12 @@ if TYPE_CHECKING:
 _FINE_TOLERANCE = 1e-3
 # A hit within the tolerance of the surface may be this many tolerances from it along its ray.
 _LONGEST_STEP = 1000.0
-# If more than this part of the jumps of a picture is of an unknown kind, derivatives are refused,
-# unless these are so few: at the tips of edges.
-_MAX_UNKNOWN, _FEW_UNKNOWN = 0.02, 2
 # A warning says if more than this part of the surface that is seen has no derivative.
 _MOST_LEFT_OUT = 0.05
+# If more than this part of the jumps of a picture is of an unknown kind, and more than so many
+# jumps of the mean size, derivatives are refused. (Where one outline passes behind another, a point
+# may be of neither.)
+_MAX_UNKNOWN, _FEW_UNKNOWN = 0.02, 4
 
 
 def with_fine_tolerance(surface: TracedSurface) -> TracedSurface:
@@ -191,8 +192,8 @@ class Drawing:
         self._check_domain(jumps.at(motion.kind == int(BoundaryKind.CUT)))
         size = np.abs(self._steps(jumps)).max(axis=1)
         is_unknown = motion.kind == int(BoundaryKind.UNKNOWN)
-        is_many = is_unknown.sum() > _FEW_UNKNOWN
-        if is_many and size[is_unknown].sum() > _MAX_UNKNOWN * size.sum():
+        few = max(_MAX_UNKNOWN, _FEW_UNKNOWN / max(len(jumps), 1))
+        if size[is_unknown].sum() > few * size.sum():
             raise NotImplementedError(
                 f"{is_unknown.sum()} of {len(jumps)} points at which the picture jumps belong to "
                 "no known kind of boundary, so it is not known how they move; a function `show` "

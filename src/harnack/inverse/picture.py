@@ -85,8 +85,8 @@ def picture(
     array. Derivatives by these parameters have all of: changes of hits and normals,
     and motions of outlines, of edges of solids, of the curves at which level sets end, of the
     curves at which `clip` or the domain cuts the surface, and of the edges of shadows, each found
-    by bisection with proved first hits. Their mean over `seed` is the derivative of the mean
-    picture. Not found are: parts of the surface, and gaps between them, that are thinner than the
+    by bisection with proved first hits, and outlines from there by Newton's method. Their mean over
+    `seed` is the derivative of the mean picture. Not found are: parts of the surface, and gaps between them, that are thinner than the
     distance of the rays; and jumps of the color by less than 0.4 percent of its range.
 
     Raises:
