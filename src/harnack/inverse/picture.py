@@ -82,12 +82,13 @@ def picture(
     Returns a Dr.Jit tensor, of the precision of the parameters, if parameters of the field or the
     level are Dr.Jit arrays, as within functions for PyTorch and JAX (`harnack.io.wrap_for_torch`);
     in double precision, if only numbers that a function `show` uses have derivatives; else a NumPy
-    array. Derivatives by these parameters have all of: changes of hits and normals,
-    and motions of outlines, of edges of solids, of the curves at which level sets end, of the
-    curves at which `clip` or the domain cuts the surface, and of the edges of shadows, each found
-    by bisection with proved first hits, and outlines from there by Newton's method. Their mean over
-    `seed` is the derivative of the mean picture. Not found are: parts of the surface, and gaps between them, that are thinner than the
-    distance of the rays; and jumps of the color by less than 0.4 percent of its range.
+    array. Derivatives by these parameters have all of: changes of hits and normals, and motions of
+    outlines, of edges of solids, of the curves at which level sets end, of the curves at which
+    `clip` or the domain cuts the surface, and of the edges of shadows, each found by bisection with
+    proved first hits, and outlines from there by Newton's method. Their mean over `seed` is the
+    derivative of the mean picture. Not found are: parts of the surface, and gaps between them, that
+    are thinner than the distance of the rays; and jumps of the color by less than 0.4 percent of
+    its range.
 
     Raises:
         TypeError, ValueError: arguments or channels of the wrong kind or size; a surface without
