@@ -172,7 +172,8 @@ class Drawing:
             if dr.grad_enabled(source):
                 for component in components_of(source):
                     first = dr.gather(type(component), component, index)
-                    zero = zero + dr.select(never, kind(first), 0)
+                    # (Of a literal, only the derivative gets into a kernel.)
+                    zero = zero + dr.replace_grad(kind(0), dr.select(never, kind(first), 0))
         return zero
 
     def _check_derivatives(self, jumps: Discontinuities, motion: BoundaryMotion) -> None:
