@@ -186,9 +186,8 @@ class Drawing:
             )
         if self._surface_moves and not has_fixed_pose(self.camera):
             raise ValueError(
-                "the camera moves with the surface, which has no derivative: give it a box, as "
-                "harnack.Camera(box=harnack.Box((-1, -1, -1), (1, 1, 1))), or a position, a target "
-                "and a fov"
+                "the camera moves with the surface, which has no derivative: give it a box, or a "
+                "position, a target and a fov"
             )
         self._check_domain(jumps.at(motion.kind == int(BoundaryKind.CUT)))
         size = np.abs(self._steps(jumps)).max(axis=1)

@@ -74,8 +74,8 @@ class Film:
         if bounds is None or not np.isfinite(bounds).all():
             if not has_fixed_pose(camera):
                 raise ValueError(
-                    "the surface reaches to infinity, so say what the picture shows: "
-                    "camera=harnack.Camera(box=harnack.Box((-1, -1, -1), (1, 1, 1))), for example"
+                    "the surface reaches to infinity, so say what the picture shows: give the "
+                    "camera a box, or a position, a target and a fov"
                 )
             bounds = np.zeros((2, 3))
         corners = np.array([*itertools.product(*bounds.T)])
