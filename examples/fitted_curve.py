@@ -42,8 +42,9 @@ def gradient(vertices: np.ndarray, goals: list[np.ndarray], seed: int) -> np.nda
 
 def smoothing(n: int, amount: float) -> np.ndarray:
     """The matrix (1 + amount L)^-1, where L is the Laplacian of a closed chain of n vertices."""
-    one = np.eye(n)
-    return np.linalg.inv(one + amount * (2 * one - np.roll(one, 1, 0) - np.roll(one, -1, 0)))
+    unit_matrix = np.eye(n)
+    laplacian = 2 * unit_matrix - np.roll(unit_matrix, 1, 0) - np.roll(unit_matrix, -1, 0)
+    return np.linalg.inv(unit_matrix + amount * laplacian)
 
 
 def fit(start: np.ndarray, goals: list[np.ndarray], steps: int) -> list[np.ndarray]:
@@ -89,7 +90,7 @@ def main(folder: Path, size: tuple[int, int] = (320, 240), steps: int = 100, n: 
         )
         for curve in shown
     ]  # fmt: skip
-    Image.fromarray(np.hstack([one.srgb[..., :3] for one in strip])).save(
+    Image.fromarray(np.hstack([picture.srgb[..., :3] for picture in strip])).save(
         folder / "fitted_curve.png"
     )
     error = mean_distance(curves[-1], target)

@@ -37,9 +37,9 @@ def draw(vertices, camera: hk.Camera, size: int, seed: int):
 
 def fit(start: np.ndarray, goals: list[np.ndarray], steps: int) -> list[np.ndarray]:
     """The curves of all steps. A step looks at two of the masks in turn."""
-    n, one = len(start), np.eye(len(start))
-    chain = 2 * one - np.roll(one, 1, 0) - np.roll(one, -1, 0)
-    smooth = np.linalg.inv(one + 2 * chain)
+    n, unit_matrix = len(start), np.eye(len(start))
+    laplacian = 2 * unit_matrix - np.roll(unit_matrix, 1, 0) - np.roll(unit_matrix, -1, 0)
+    smooth = np.linalg.inv(unit_matrix + 2 * laplacian)
     curve, curves = start, [start]
     mean = square = np.zeros((n, 3))
     for k in range(steps):
@@ -112,7 +112,7 @@ def main(
         )
         for curve in shown
     ]
-    Image.fromarray(np.hstack([one.srgb[..., :3] for one in strip])).save(
+    Image.fromarray(np.hstack([picture.srgb[..., :3] for picture in strip])).save(
         folder / "fitted_knot.png"
     )
     steps_between = np.arange(40)[:, None] / 40

@@ -111,9 +111,9 @@ def main(
     path = fit([goal.astype(float) for goal in goals], n, steps)
     shown = [of_numbers(x) for x in (path[0], path[min(steps // 4, 10)], path[-1])]
     strip = [
-        hk.render(one, show="shaded", size=size, camera=CAMERAS[3]) for one in (*shown, target)
+        hk.render(drawn, show="shaded", size=size, camera=CAMERAS[3]) for drawn in (*shown, target)
     ]
-    Image.fromarray(np.hstack([one.srgb[..., :3] for one in strip])).save(
+    Image.fromarray(np.hstack([picture.srgb[..., :3] for picture in strip])).save(
         folder / "fitted_points.png"
     )
     before, after = (chamfer(x, vertices, faces) for x in (path[0], path[-1]))

@@ -113,7 +113,7 @@ def main(folder: Path, size: tuple[int, int] = (240, 180), steps: int = 100) -> 
             hk.render(fit.make(x.tolist()), show="shaded", size=size, camera=fit.cameras[0])
             for x in shown
         ]
-        rows.append(np.hstack([one.srgb[..., :3] for one in pictures]))
+        rows.append(np.hstack([picture.srgb[..., :3] for picture in pictures]))
     Image.fromarray(np.vstack(rows)).save(folder / "fitted_shapes.png")
     return errors
 

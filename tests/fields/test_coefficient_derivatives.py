@@ -114,9 +114,9 @@ def tree_map(function: Callable[..., Any], *trees: Any) -> Any:
 
 
 def leaves(tree: Any) -> list[Any]:
-    found: list[Any] = []
-    tree_map(found.append, tree)
-    return found
+    entries: list[Any] = []
+    tree_map(entries.append, tree)
+    return entries
 
 
 def with_derivatives(numbers: Any) -> Any:
@@ -173,8 +173,8 @@ def check(numbers: Any, make: Callable[..., Any]) -> None:
         dr.clear_grad(number)
     dr.backward(total)
     pairs = zip(leaves(attached), leaves(change), strict=True)
-    found = sum((np.ravel(dr.grad(a)) * np.ravel(c)).sum() for a, c in pairs)
-    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    reverse = sum((np.ravel(dr.grad(a)) * np.ravel(c)).sum() for a, c in pairs)
+    np.testing.assert_allclose(reverse, expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ ATTACHED = {
 def test_makers_refuse_each_argument_that_carries_derivatives(name: str) -> None:
     names = arguments(MAKERS[name])
     assert names or name in ("SexticKernel", "CubicKernel")
-    traits, given = getattr(MAKERS[name], "traits", None), MADE_OF.get(name, {})
+    traits, known_arguments = getattr(MAKERS[name], "traits", None), MADE_OF.get(name, {})
     # Other classes with derivatives by parameters fail here: for those, derivatives are tested in
     # `test_source_derivatives`.
     is_refused = traits is None or name in MADE_OF or not traits.has_parameter_derivatives
@@ -139,9 +139,9 @@ def test_makers_refuse_each_argument_that_carries_derivatives(name: str) -> None
     for argument in names:
         for mark in ("torch",) if argument in attached else MARKS:
             with refuses(argument in attached):
-                MAKERS[name](**{**given, argument: learned(mark)})
+                MAKERS[name](**{**known_arguments, argument: learned(mark)})
         with refuses(argument in attached):
-            MAKERS[name](**{**given, argument: [(1.0, {"deep": learned("number")})]})
+            MAKERS[name](**{**known_arguments, argument: [(1.0, {"deep": learned("number")})]})
 
 
 def test_the_list_of_makers_has_what_is_known() -> None:

@@ -100,8 +100,8 @@ class RecordTable:
         early if they are passed on to a gather as they are, and loses some now and then; a
         multiplication waits for the loop.
         """
-        one = dr.opaque(self.backend.Float, 1)  # a product with a literal would be none
-        return replace(self, buffer=dr.replace_grad(self.buffer, entries * one))
+        factor = dr.opaque(self.backend.Float, 1)  # a product with a literal would be none
+        return replace(self, buffer=dr.replace_grad(self.buffer, entries * factor))
 
     def view(self, first: Any, trips: Any) -> RecordTable:
         """Return a part of the table: `trips` consecutive records, from record `first` on. Both

@@ -206,8 +206,8 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
                 inputs, outputs = run_function(ctx.arguments, ctx.saved_tensors)
                 graph = inputs, _results(outputs)
             inputs, outputs = graph
-            given = [None if value is None else value.detach() for value in cotangents]
-            parts = _gradients(inputs, outputs, given)
+            plain_cotangents = [None if value is None else value.detach() for value in cotangents]
+            parts = _gradients(inputs, outputs, plain_cotangents)
             gradients = [part.torch() for part in parts]
             if torch.is_grad_enabled():  # create_graph=True
                 sources = [

@@ -34,6 +34,7 @@ __all__ = [
     "attached_array",
     "host_array",
     "opaque_numbers",
+    "plain_array",
     "scaled_in_space",
     "separate_variable",
     "with_formula",
@@ -54,16 +55,18 @@ def host_array(
     name, error, type_error: as of `as_real_array`, which raises the errors.
     """
     return np.array(
-        as_real_array(_without_derivatives(values), name, error, type_error=type_error), np.float64
+        as_real_array(plain_array(values), name, error, type_error=type_error), np.float64
     )
 
 
-def _without_derivatives(values: Any) -> Any:
-    """The values, with NumPy arrays in place of Dr.Jit arrays."""
-    if isinstance(values, list | tuple):
-        return [_without_derivatives(entry) for entry in cast("Any", values)]
+def plain_array(values: Any) -> Any:
+    """The values without derivatives: NumPy arrays in place of Dr.Jit arrays and tensors, also of
+    those in lists and tuples; a number in place of a Dr.Jit array of one entry; all else as it
+    is."""
+    if isinstance(values, list | tuple) and _has_drjit(values):
+        return [plain_array(entry) for entry in cast("Any", values)]
     if not _is_drjit(values):
-        return values
+        return cast("Any", values)
     if dr.is_tensor_v(values):
         return np.array(dr.detach(values))
     array = to_numpy(values)

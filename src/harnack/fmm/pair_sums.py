@@ -229,8 +229,8 @@ class _PairSum(dr.CustomOp):
 
     def _term_count(self) -> int:
         """How many numbers the term returns."""
-        one = self._backend.Float(1)
-        return len(self._term(self._backend.Array3f(1), (one,) * len(self._records)))
+        number = self._backend.Float(1)
+        return len(self._term(self._backend.Array3f(1), (number,) * len(self._records)))
 
     def _over_records(self, add: Any, state: tuple[Any, ...], label: str) -> tuple[Any, ...]:
         """Run a loop over the records of each point, and return the final state.

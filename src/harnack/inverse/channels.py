@@ -121,8 +121,8 @@ def channel_function(
     Raises:
         TypeError, ValueError: a name that is none of `Show`, or arguments that are no numbers.
     """
-    given = np.ravel(background).tolist()
-    colors = tuple(as_real(number, "background") for number in given)
+    numbers = np.ravel(background).tolist()
+    colors = tuple(as_real(number, "background") for number in numbers)
     if callable(show):
         has_own = has_derivatives(show)
         return ChannelFunction(cast("Any", show), colors, has_derivatives=has_own)

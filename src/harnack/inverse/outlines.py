@@ -84,10 +84,11 @@ def with_exact_outlines(
     motions = depth * (film.directions(moved) - film.directions(inside)) / _DIFFERENCE
     low, high = ends[n, 0, axis], ends[n, 1, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
-        found: FloatArray = inside[n, axis] + gap / (gradient * motions).sum(axis=1)
-    place: FloatArray = np.where(np.isfinite(found), np.clip(found, low, high), (low + high) / 2)
+        touching: FloatArray = inside[n, axis] + gap / (gradient * motions).sum(axis=1)
+    middle = (low + high) / 2
+    place: FloatArray = np.where(np.isfinite(touching), np.clip(touching, low, high), middle)
     screen = jumps.screen.copy()
-    screen[index, :, axis] += (place - (low + high) / 2)[:, None]
+    screen[index, :, axis] += (place - middle)[:, None]
     return replace(
         jumps, screen=screen, before=replace(jumps.before, color=before),
         behind=replace(jumps.behind, color=behind),

@@ -27,6 +27,7 @@ import numpy as np
 from harnack.backend import backend_of
 from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_positive, as_real, check_no_derivatives
+from harnack.fields.attached_arrays import plain_array
 from harnack.fields.batched_fields import SourceSum, SumEvaluator, cached_upload
 from harnack.fields.capabilities import Boundary
 from harnack.fields.evaluator import POINTS, Plan
@@ -34,11 +35,7 @@ from harnack.fields.field import Sample, space_scaled
 from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.cell_options import CellChoice, FieldWithCells
 from harnack.fields.solid_angles.denoised_cloud import DenoisedCloud
-from harnack.fields.solid_angles.oriented_points import (
-    OrientedPoints,
-    check_estimates,
-    plain_arrays,
-)
+from harnack.fields.solid_angles.oriented_points import OrientedPoints, check_estimates
 from harnack.fields.solid_angles.smoothed import SmoothedKernel, SmoothedSum
 from harnack.fmm.dipole_cells import DipoleCells, TreeWithCells, build_cells
 from harnack.fmm.moving_dipoles import MovingDipoles
@@ -356,7 +353,7 @@ class DipolePotential(OrientedPoints, FieldWithCells, SourceSum):
             has_normals=not isinstance(normals, str),
             has_areas=areas is not None,
         )
-        points, normals, areas = plain_arrays(points, normals, areas)
+        points, normals, areas = map(plain_array, (points, normals, areas))
         if isinstance(normals, str) and normals != "estimate":
             raise CloudError(f'normals must be (n, 3) or "estimate", not {normals!r}')
         self.fit_report: dict[str, Any] = {}

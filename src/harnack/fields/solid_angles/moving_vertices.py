@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import numpy as np
 
-from harnack.backend import to_numpy
 from harnack.backend.arrays import upload_vectors
 from harnack.backend.tensors import is_tensor, tensor_to_vectors
+from harnack.fields.parameters import Parametrized, kept_arguments
 from harnack.fmm.moving_edges import MovingEdges
 from harnack.fmm.unit_frame import UnitFrame, frame_parameters
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 _NO_EDGE = np.zeros((1, 2), np.int64)
 
 
-def plain_vertices(vertices: Any) -> Any:
-    """Vertices without derivatives: a Dr.Jit array or tensor as a NumPy array, all else as it
-    is."""
-    if not dr.is_array_v(type(vertices)):
-        return vertices
-    return dr.detach(vertices).numpy() if is_tensor(vertices) else to_numpy(vertices)
+def drjit_vertices(mesh: Parametrized) -> Any:
+    """The vertices with which a field was made, if these were a Dr.Jit array or tensor; else
+    None."""
+    vertices = kept_arguments(mesh).get("vertices")
+    return vertices if dr.is_array_v(type(vertices)) else None
 
 
-def vertex_vectors(backend: Backend, given: Any, plain: FloatArray) -> Vec3:
-    """Vertices as a 3-vector of a backend, with their derivatives if they have some.
+def moving_vectors(backend: Backend, vectors: Any, plain: FloatArray) -> Vec3:
+    """Vertices, points or normals as a 3-vector of a backend, with their derivatives if they have
+    any.
 
-    given: a Dr.Jit 3-vector, or a tensor (n, 3); or None.
+    vectors: a Dr.Jit 3-vector, or a tensor (n, 3); or None.
     plain: (n, 3) the numbers that are taken if it is None.
     """
-    if given is None:
+    if vectors is None:
         return upload_vectors(backend, plain)
-    return backend.Array3f(tensor_to_vectors(given) if is_tensor(given) else given)
+    return backend.Array3f(tensor_to_vectors(vectors) if is_tensor(vectors) else vectors)
 
 
 @dataclass(frozen=True)

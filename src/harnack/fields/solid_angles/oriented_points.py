@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 
-from harnack.backend import to_numpy
-from harnack.backend.arrays import upload_floats, upload_vectors
-from harnack.backend.tensors import is_tensor, tensor_to_array, tensor_to_vectors
+from harnack.backend.arrays import upload_floats
+from harnack.backend.tensors import is_tensor, tensor_to_array
 from harnack.backend.validation import check_no_derivatives
 from harnack.fields.parameters import kept_arguments
+from harnack.fields.solid_angles.moving_vertices import moving_vectors
 from harnack.fmm.moving_dipoles import MovingDipoles
 
 if TYPE_CHECKING:
-    from harnack.backend import Backend, FloatArray, Real, Vec3
+    from harnack.backend import Backend, FloatArray, Real
     from harnack.fmm.radial_kernel import RadialKernel
     from harnack.fmm.unit_frame import UnitFrame
 
@@ -66,71 +66,46 @@ class OrientedPoints:
                 enabled: these derivatives are not known.
         """
         kept = kept_arguments(self)
-        given = {name: kept[name] for name in _NAMES if _is_drjit(kept.get(name))}
-        if not any(map(dr.grad_enabled, given.values())):
+        arrays = {name: kept[name] for name in _NAMES if _is_drjit(kept.get(name))}
+        if not any(map(dr.grad_enabled, arrays.values())):
             return None
         has_normals, has_areas = (not is_estimated for is_estimated in self.is_estimated)
-        check_estimates(type(self).__name__, given, has_normals=has_normals, has_areas=has_areas)
+        check_estimates(type(self).__name__, arrays, has_normals=has_normals, has_areas=has_areas)
         backend = frame.backend
         return MovingDipoles.of(
             frame,
             kernel,
-            _vectors(backend, given.get("points"), self._points),
-            _vectors(backend, given.get("normals"), self._normals),
-            factor * _numbers(backend, given.get("areas"), self._areas),
+            moving_vectors(backend, arrays.get("points"), self._points),
+            moving_vectors(backend, arrays.get("normals"), self._normals),
+            factor * _numbers(backend, arrays.get("areas"), self._areas),
         )
 
 
 _NAMES = "points", "normals", "areas"
 
 
-def plain_arrays(*arrays: Any) -> tuple[Any, ...]:
-    """Points, normals or areas without derivatives: Dr.Jit arrays as NumPy arrays, all else as it
-    is. A Dr.Jit array of one entry becomes a number."""
-    return tuple(_plain(array) if _is_drjit(array) else array for array in arrays)
-
-
-def _plain(array: Any) -> Any:
-    """A Dr.Jit array or tensor as a NumPy array."""
-    if is_tensor(array):
-        return dr.detach(array).numpy()
-    numbers = to_numpy(array)
-    return numbers[0] if numbers.shape == (1,) else numbers
-
-
 def check_estimates(
-    name: str, given: Mapping[str, Any], *, has_normals: bool, has_areas: bool
+    name: str, arrays: Mapping[str, Any], *, has_normals: bool, has_areas: bool
 ) -> None:
     """Raise NotImplementedError if normals or areas are estimated from points or normals that have
     derivatives enabled: how the estimates change is not known.
 
     name: the name of the field's class.
-    given: the arguments "points" and "normals".
+    arrays: the arguments "points" and "normals".
     has_normals, has_areas: whether normals and areas are given.
     """
-    points, normals = given.get("points"), given.get("normals")
+    points, normals = arrays.get("points"), arrays.get("normals")
     if not has_normals:
         check_no_derivatives(f"{name} with estimated normals", points)
     if not has_areas:
         check_no_derivatives(f"{name} with estimated areas", points, normals)
 
 
-def _vectors(backend: Backend, given: Any, plain: FloatArray) -> Vec3:
-    """Points or normals as vectors of a backend.
-
-    given: a Dr.Jit 3-vector or a tensor (n, 3), possibly with derivatives; or None.
-    plain: (n, 3) the numbers that are taken if it is None.
-    """
-    if given is None:
-        return upload_vectors(backend, plain)
-    return backend.Array3f(tensor_to_vectors(given) if is_tensor(given) else given)
-
-
-def _numbers(backend: Backend, given: Any, plain: FloatArray) -> Real:
-    """Areas as an array of a backend; arguments as of `_vectors`."""
-    if given is None:
+def _numbers(backend: Backend, areas: Any, plain: FloatArray) -> Real:
+    """Areas as an array of a backend; arguments as of `moving_vectors`."""
+    if areas is None:
         return upload_floats(backend, plain)
-    return backend.Float(tensor_to_array(given) if is_tensor(given) else given)
+    return backend.Float(tensor_to_array(areas) if is_tensor(areas) else areas)
 
 
 def _is_drjit(value: Any) -> bool:

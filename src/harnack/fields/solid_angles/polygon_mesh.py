@@ -38,12 +38,12 @@ from harnack.backend.validation import check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, Lipschitz
 from harnack.enclosures.samples import Ray, RaySample, Sample, space_scaled
+from harnack.fields.attached_arrays import plain_array
 from harnack.fields.batched_fields import cached_upload
 from harnack.fields.evaluator import POINTS, Evaluator, Plan
 from harnack.fields.field import Traits
-from harnack.fields.parameters import kept_arguments
 from harnack.fields.patch_boxes import PatchBoxes, PatchesInBoxes, PatchField
-from harnack.fields.solid_angles.moving_vertices import plain_vertices, vertex_vectors
+from harnack.fields.solid_angles.moving_vertices import drjit_vertices, moving_vectors
 from harnack.fields.solid_angles.solid_angle import SolidAngle
 from harnack.fmm.curve_queries import lift_ball, remainder_promises
 from harnack.fmm.edges import (
@@ -561,7 +561,7 @@ class PolygonMesh(PatchField):
         """Validate vertices (n, 3) and faces, a list of polygons: each is a list of indices of
         vertices, or a list of such loops."""
         check_no_derivatives(type(self).__name__, faces)
-        self.faces: PolygonFaces = validate_polygons(plain_vertices(vertices), faces)
+        self.faces: PolygonFaces = validate_polygons(plain_array(vertices), faces)
         if self.faces.face_count >= MAX_BOXES:
             raise ValueError(
                 f"{self.faces.face_count:,} faces are too many: at most {MAX_BOXES:,}; cut the "
@@ -583,17 +583,11 @@ class PolygonMesh(PatchField):
         loops = np.split(self.faces.corners, self.faces.loop_starts[1:])
         for owner, loop in zip(self.faces.face_of_loop, loops, strict=True):
             faces[owner].append(loop.tolist())
-        given = self._given_vertices
+        vertices = drjit_vertices(self)
         return {
-            "vertices": self.vertices if given is None else given,
+            "vertices": self.vertices if vertices is None else vertices,
             "faces": [face if len(face) > 1 else face[0] for face in faces],
         }
-
-    @property
-    def _given_vertices(self) -> Any:
-        """The vertices as they were given, if that was as a Dr.Jit array or tensor; else None."""
-        vertices = kept_arguments(self).get("vertices")
-        return vertices if dr.is_array_v(type(vertices)) else None
 
     @property
     def edges(self) -> IntArray:
@@ -607,11 +601,11 @@ class PolygonMesh(PatchField):
         if not 0 <= index < self.faces.face_count:
             last = self.faces.face_count - 1
             raise IndexError(f"there is no face {index}: they are counted from 0 to {last}")
-        given = self._given_vertices
-        if given is None:
+        moving = drjit_vertices(self)
+        if moving is None:
             return SolidAngle(self.faces.loops(index))
-        backend = backend_of(given.array if is_tensor(given) else given)
-        vertices = vertex_vectors(backend, given, self.vertices)
+        backend = backend_of(moving.array if is_tensor(moving) else moving)
+        vertices = moving_vectors(backend, moving, self.vertices)
         corners = np.split(self.faces.corners, self.faces.loop_starts[1:])
         loops = [corners[k] for k in np.flatnonzero(self.faces.face_of_loop == index)]
         return SolidAngle(
@@ -639,7 +633,7 @@ class PolygonMesh(PatchField):
 
         def moving() -> FaceEdges:
             """The edges of all faces, with derivatives by vertices."""
-            vertices = vertex_vectors(backend, self._given_vertices, self.vertices)
+            vertices = moving_vectors(backend, drjit_vertices(self), self.vertices)
             return patches.curves.moving_edges(vertices, self.faces)
 
         return self.evaluator_of(replace(patches, moving=moving))

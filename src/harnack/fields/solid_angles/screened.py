@@ -23,14 +23,11 @@ from harnack.backend.elementary import fmax, fmin
 from harnack.backend.validation import as_positive, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import HarmonicBall, TaylorRemainder
+from harnack.fields.attached_arrays import plain_array
 from harnack.fields.batched_fields import SourceSum, cached_upload
 from harnack.fields.clearance import tight_extent
 from harnack.fields.field import Sample
-from harnack.fields.solid_angles.oriented_points import (
-    OrientedPoints,
-    check_estimates,
-    plain_arrays,
-)
+from harnack.fields.solid_angles.oriented_points import OrientedPoints, check_estimates
 from harnack.fmm.moving_dipoles import MovingDipoles
 from harnack.fmm.point_values import PointValues
 from harnack.fmm.radial_kernel import (
@@ -343,9 +340,9 @@ class ScreenedWindingNumber(OrientedPoints, SourceSum):
             raise ValueError(f"accuracy must lie between 2 and 100, not {accuracy!r}")
         name = type(self).__name__
         self.is_estimated = [False, areas is None]  # normals, areas
-        given = {"points": points, "normals": normals}
-        check_estimates(name, given, has_normals=True, has_areas=areas is not None)
-        points, normals, areas = plain_arrays(points, normals, areas)
+        arrays = {"points": points, "normals": normals}
+        check_estimates(name, arrays, has_normals=True, has_areas=areas is not None)
+        points, normals, areas = map(plain_array, (points, normals, areas))
         if areas is None:
             areas = estimate_areas(points, normals)
         self._set_points(*validate_cloud(points, normals, areas))

@@ -37,6 +37,7 @@ from harnack.backend.elementary import fmax
 from harnack.backend.validation import as_integer_in_range, as_real, check_no_derivatives
 from harnack.cluster.serialization import TransientCache
 from harnack.enclosures import Lipschitz
+from harnack.fields.attached_arrays import plain_array
 from harnack.fields.batch_evaluation import evaluate_points
 from harnack.fields.batched_fields import BatchedEvaluator, BatchedField, cached_upload
 from harnack.fields.capabilities import (
@@ -51,7 +52,7 @@ from harnack.fields.capabilities import (
 from harnack.fields.clearance import occupied_cells, tight_extent
 from harnack.fields.evaluator import POINTS, EvaluateOnly, Evaluator, Plan
 from harnack.fields.field import Field, Sample, Traits, space_scaled
-from harnack.fields.parameters import kept_arguments, record_arguments
+from harnack.fields.parameters import record_arguments
 from harnack.fields.solid_angles.boundary_cells import BoundaryCells
 from harnack.fields.solid_angles.cell_options import (
     NO_CELLS,
@@ -61,8 +62,8 @@ from harnack.fields.solid_angles.cell_options import (
 )
 from harnack.fields.solid_angles.moving_vertices import (
     MovingWinding,
-    plain_vertices,
-    vertex_vectors,
+    drjit_vertices,
+    moving_vectors,
 )
 from harnack.fields.solid_angles.own_sheet import lies_on_own_level
 from harnack.fields.solid_angles.winding_exact import ExactWinding
@@ -325,7 +326,7 @@ class WindingNumber(FieldWithCells, BatchedField):
         if accuracy is not None and not 1.5 <= as_real(accuracy, "accuracy") <= 100:
             raise ValueError(f"accuracy must lie between 1.5 and 100, not {accuracy}")
         order = as_integer_in_range(order, "order", 0, 2)
-        self._mesh = WindingMesh.of(plain_vertices(vertices), faces)
+        self._mesh = WindingMesh.of(plain_array(vertices), faces)
         has_few_edges = len(self.mesh.singular_edges) <= _MAX_EXACT_EDGES
         self._method: Literal["exact", "tree"] = (
             ("exact" if has_few_edges else "tree") if method == "auto" else method
@@ -352,7 +353,7 @@ class WindingNumber(FieldWithCells, BatchedField):
         Raises MeshError as for a new mesh, and for vertices that coincided and come apart.
         """
         field = copy.copy(self)
-        field._mesh = self.mesh.with_vertices(plain_vertices(vertices))
+        field._mesh = self.mesh.with_vertices(plain_array(vertices))
         record_arguments(field, vertices=vertices)  # they may have derivatives
         vars(field).pop("_detached_copy", None)
         # What was computed from the old positions is dropped.
@@ -365,7 +366,7 @@ class WindingNumber(FieldWithCells, BatchedField):
     def detached(self) -> WindingNumber:
         """The same field without derivatives by its vertices; this field itself if it was given
         NumPy arrays."""
-        return self if self._given_vertices is None else self._detached_copy
+        return self if drjit_vertices(self) is None else self._detached_copy
 
     @functools.cached_property
     def _detached_copy(self) -> WindingNumber:
@@ -395,26 +396,20 @@ class WindingNumber(FieldWithCells, BatchedField):
 
     def constructor_arguments(self) -> dict[str, Any]:
         """The arguments of the constructor by name."""
-        vertices = self._given_vertices
+        vertices = drjit_vertices(self)
         mesh = {
             "vertices": self.mesh.vertices if vertices is None else vertices,
             "faces": self.mesh.input_faces,
         }
         return {**super().constructor_arguments(), **mesh}
 
-    @property
-    def _given_vertices(self) -> Any:
-        """The vertices as they were given, if that was as a Dr.Jit array or tensor; else None."""
-        vertices = kept_arguments(self).get("vertices")
-        return vertices if dr.is_array_v(type(vertices)) else None
-
     def moving_vertices(self, backend: Backend) -> Vec3:
         """The vertices as a 3-vector of a backend, with their derivatives if they have some."""
-        return vertex_vectors(backend, self._given_vertices, self.mesh.vertices)
+        return moving_vectors(backend, drjit_vertices(self), self.mesh.vertices)
 
     def moving_sum(self, backend: Backend) -> MovingWinding | None:
         """w on a backend with derivatives by vertices (`BatchedField.moving_sum`)."""
-        vertices = self._given_vertices
+        vertices = drjit_vertices(self)
         if vertices is None or not dr.grad_enabled(vertices):
             return None
         return MovingWinding.of(self, backend)

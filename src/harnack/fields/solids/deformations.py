@@ -89,10 +89,10 @@ class Deformation(SpaceMap, Parametrized):
 
     def with_read_numbers(self, numbers: NumberReader) -> Deformation:
         """The copy with the numbers as a reader gives them."""
-        other, given = copy.copy(self), self._given()
+        other, arguments = copy.copy(self), self._given()
         for entry in dataclasses.fields(cast("Any", self)):
             plain = getattr(self, entry.name)
-            argument = given.get(entry.name, plain)
+            argument = arguments.get(entry.name, plain)
             if isinstance(plain, float):
                 object.__setattr__(other, entry.name, numbers.vector(argument, [plain])[0])
             elif isinstance(plain, tuple):
@@ -312,8 +312,8 @@ class Taper(Deformation):
         """
         axis_index(self.axis)
         pairs = {"start": self.start, "end": self.end}
-        given = {name: end for name, end in pairs.items() if is_attached_number(end, "a taper")}
-        object.__setattr__(self, "_given_numbers", given)
+        attached = {name: end for name, end in pairs.items() if is_attached_number(end, "a taper")}
+        object.__setattr__(self, "_given_numbers", attached)
         for name, value in pairs.items():
             plain = detached(value)
             if plain is not value and np.ndim(plain) == 1:

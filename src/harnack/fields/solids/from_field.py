@@ -96,8 +96,8 @@ def solid(
     # `between` and `around` have two numbers, `below` and `above` one.
     is_band = between is not None or around is not None
     numbers = _levels(bounds[0] if is_band else (bounds[0],), 2 if is_band else 1)
-    given: Any = bounds[0] if is_band else (bounds[0],)
-    is_attached = has_derivatives(given)
+    levels: Any = bounds[0] if is_band else (bounds[0],)
+    is_attached = has_derivatives(levels)
     if numbers is None:
         count = ", two of them" if is_band else ""
         raise ValueError(f"levels must be finite numbers{count}, not {bounds[0]!r}")
@@ -109,17 +109,17 @@ def solid(
     # f <= level is an offset of f <= 0; f >= level is the complement.
     sublevel = SublevelSolid(field)
     if below is not None:
-        return OffsetSolid(sublevel, given[0])
+        return OffsetSolid(sublevel, levels[0])
     if above is not None:
-        return Complement(OffsetSolid(sublevel, given[0]))
+        return Complement(OffsetSolid(sublevel, levels[0]))
     lower, upper = numbers
     # Here `around` is given: lower is its level, and upper its half width.
     if around is not None:
-        return BandSolid(field, given[0], given[1])
+        return BandSolid(field, levels[0], levels[1])
     if not lower < upper:
         raise ValueError(f"between must be (low, high) with low < high, not {between}")
     if is_attached:
-        lower, upper = given
+        lower, upper = levels
     return BandSolid(field, (lower + upper) * 0.5, (upper - lower) * 0.5)
 
 
@@ -421,14 +421,14 @@ class BandSolid(SolidOfField):
             ValueError: a number is not finite, or half_width is not positive or too large.
         """
         _check_has_formula_if_attached(self)
-        given = self.level, self.half_width
+        numbers = self.level, self.half_width
         object.__setattr__(self, "level", as_finite(self.level, "level"))
         object.__setattr__(self, "half_width", as_finite(self.half_width, "half_width"))
         if not self.half_width > 0:
             raise ValueError(f"half_width must be positive, not {self.half_width:g}")
         period = self.field.period
         if period is not None:
-            check_no_derivatives("a solid around a level of an angle", given)
+            check_no_derivatives("a solid around a level of an angle", numbers)
         if period is not None and not 2 * self.half_width < period:
             raise ValueError(f"half_width must be below {period / 2:g}, half of the period")
         self._copy_settings()

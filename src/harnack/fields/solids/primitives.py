@@ -65,8 +65,8 @@ class Plane(FormulaSolid):
     def with_read_numbers(self, numbers: NumberReader) -> Plane:
         """The copy with the unit vector along the normal that was given, with its derivatives."""
         other = with_attached_arguments(self, ("distance",), numbers)
-        given: tuple[float, ...] = vars(self)["_given_normal"]
-        normal = numbers.vector(kept_arguments(self).get("normal", given), given)
+        direction: tuple[float, ...] = vars(self)["_given_normal"]
+        normal = numbers.vector(kept_arguments(self).get("normal", direction), direction)
         length = norm(*normal)
         set_frozen(other, "normal", tuple(v / length for v in normal))
         return other

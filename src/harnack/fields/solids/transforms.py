@@ -180,8 +180,8 @@ class AffineMap(SpaceMap, Parametrized):
         turn = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
         if not is_attached:
             return cls.of_arrays(turn)
-        given = {"degrees": degrees, "axis": vector if is_name else axis}
-        own = _AttachedNumbers(given, _inverse_rotation)
+        arguments = {"degrees": degrees, "axis": vector if is_name else axis}
+        own = _AttachedNumbers(arguments, _inverse_rotation)
         return replace(cls.of_arrays(turn), attached=own)
 
     @classmethod

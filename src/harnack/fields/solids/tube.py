@@ -226,11 +226,11 @@ class Tube(Solid):
     def with_read_numbers(self, numbers: NumberReader) -> AlikeParts:
         """The same function of the points and the radius with their derivatives."""
         table, kept = cast("NumberTable", numbers), kept_arguments(self)
-        given = vars(self)["_given_indices"]
+        indices = vars(self)["_given_indices"]
         points = kept.get("points")
-        count = len(given) if points is None else plain_numbers(points).shape[0]
+        count = len(indices) if points is None else plain_numbers(points).shape[0]
         places = table.places(points, 3 * count).reshape(-1, 3)[
-            given if points is not None else ...
+            indices if points is not None else ...
         ]
         start = self._segment_starts()
         ends = np.stack([start, start + 1], axis=1)
