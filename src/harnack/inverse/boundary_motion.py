@@ -57,8 +57,8 @@ _FLATTEST = 0.02
 _TOUCHING, _BEND = 0.1, 0.6
 # The jump is then found within this part of a pixel from the outline, or the accuracy of jumps.
 _NEAR_OUTLINE = 0.005
-# On one smooth side of the surface, gradients there have at least this cosine.
-_SAME_SIDE = 0.9
+# By so much the cosine of the turn of the normal up to the contact may be below what is expected.
+_MORE_TURN = 0.1
 # For edges, rays pass this part of a pixel inside of the outline; both crossings of such a ray are
 # at most this part of the width of a pixel from the edge; or so many, if it leaves through a side
 # that is nearly parallel to it.
@@ -126,83 +126,155 @@ def boundary_motion(
     traits = surface.field.traits
     if traits.has_jumps or traits.has_patches or not len(jumps):
         return BoundaryMotion.unknown(len(jumps))
-    before, behind = jumps.before, jumps.behind
-    is_front = before.t <= behind.t
-    x = np.where(is_front[:, None], before.position, behind.position)
-    other = np.where(is_front[:, None], behind.position, before.position)
-    g, directions = gradients_at(tracer, x), film.directions(jumps.middle)
-    sine, other_sine = _sines(g, directions), _sines(gradients_at(tracer, other), directions)
-    width = film.pixel_width(x)
-    resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
-    near = _SAME_POINT * resolution * width / np.maximum(sine, _TOUCHING)
-    # The two sides of a crease are apart by what the flatter one is seen to recede.
-    flatter = np.fmin(sine, other_sine)
-    near_other = _SAME_POINT * resolution * width / np.maximum(flatter, _FLATTEST)
-    kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
-    conditions = Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
+    points = _JumpPoints.of(jumps, film, surface, tracer)
+    points.take_creases()
+    points.take_ends()
+    points.take_cuts()
+    points.take_outlines()
+    points.take_edges()
+    # What is left touches the surface at corners, where edges end in outlines.
+    points.take(points.sine < _TOUCHING, BoundaryKind.OUTLINE)
+    return solve_conditions(jumps, film, points.kind, points.x, points.conditions)
 
-    def take(which: BoolArray, value: BoundaryKind) -> IntArray:
-        """Give points that have no kind yet this one; returns their indices."""
-        index = np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & which)
-        kind[index] = int(value)
+
+@dataclass(frozen=True)
+class _JumpPoints:
+    """The points at which a picture jumps, while their kinds are told. A kind that was told stays.
+
+    jumps, film, surface, tracer: as of `boundary_motion`.
+    is_front: (n,) whether what is in front is seen before the jump.
+    x, other: (n, 3) the points of the surface that are seen in front, and on the other side.
+    gradient: (n, 3) grad f at x.
+    directions: (n, 3) of the rays.
+    sine: (n,) of the angles between rays and surface at x.
+    width: (n,) of a pixel at x, a length.
+    resolution: (n,) the accuracy of the jumps, in pixels.
+    kind: (n,) a `BoundaryKind` for each point.
+    conditions: those by which the points stay on the boundary.
+    """
+
+    jumps: Discontinuities
+    film: Screen
+    surface: TracedSurface
+    tracer: SurfaceTracer
+    is_front: BoolArray
+    x: FloatArray
+    other: FloatArray
+    gradient: FloatArray
+    directions: FloatArray
+    sine: FloatArray
+    width: FloatArray
+    resolution: FloatArray
+    kind: IntArray
+    conditions: Conditions
+
+    @classmethod
+    def of(
+        cls, jumps: Discontinuities, film: Screen, surface: TracedSurface, tracer: SurfaceTracer
+    ) -> _JumpPoints:
+        """The points before their kinds are told."""
+        before, behind = jumps.before, jumps.behind
+        is_front = before.t <= behind.t
+        x = np.where(is_front[:, None], before.position, behind.position)
+        other = np.where(is_front[:, None], behind.position, before.position)
+        g, directions = gradients_at(tracer, x), film.directions(jumps.middle)
+        resolution = np.abs(jumps.screen[:, 1] - jumps.screen[:, 0]).max(axis=1)
+        kind = np.full(len(x), int(BoundaryKind.UNKNOWN))
+        conditions = Conditions(x.copy(), g.copy(), x.copy(), np.zeros_like(x))
+        return cls(
+            jumps, film, surface, tracer, is_front, x, other, g, directions,
+            _sines(g, directions), film.pixel_width(x), resolution, kind, conditions,
+        )  # fmt: skip
+
+    def left(self, which: BoolArray | bool = True) -> IntArray:
+        """The indices of points of unknown kind, of those in a mask."""
+        return np.flatnonzero((self.kind == int(BoundaryKind.UNKNOWN)) & which)
+
+    def take(self, which: BoolArray, value: BoundaryKind) -> IntArray:
+        """Give points of unknown kind this one; returns their indices."""
+        index = self.left(which)
+        self.kind[index] = int(value)
         return index
 
-    with np.errstate(invalid="ignore"):
-        is_same = np.linalg.norm(x - other, axis=1) < near_other
-    if (index := take(before.is_hit & behind.is_hit & is_same, BoundaryKind.CREASE)).size:
-        conditions.set_second(index, other[index], gradients_at(tracer, other[index]))
-    curve = _closest_on_curves(tracer, x)
-    if curve is not None:
-        is_near = np.linalg.norm(x - curve, axis=1) < near
-        if (index := take(is_near, BoundaryKind.END)).size:
-            beside = _beside_curve(x[index], curve[index], g[index])
-            gradients = [gradients_at(tracer, points) for points in beside]
-            conditions.set_first(index, beside[0], gradients[0])
-            conditions.set_second(index, beside[1], gradients[1])
-            x[index] = curve[index]
-    cut = intersection_of([surface.field.domain, surface.clip_volume])
-    if cut is not None:
-        depth = to_numpy(cut.signed_distance(upload_vectors(tracer.backend, x)))
-        if (index := take(np.abs(depth) < near, BoundaryKind.CUT)).size:
-            normal = cut.outward_normal(upload_vectors(tracer.backend, x[index]))
-            conditions.set_second(index, x[index], to_numpy(normal).reshape(-1, 3))
-    index = np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & (sine < _TOUCHING))
-    if index.size:
-        contact = _contact(tracer, x[index], g[index], directions[index], width[index])
-        g_contact, gap = gradients_at(tracer, contact), _gaps(tracer, contact)
-        # Else the surface ends before, at an edge.
-        is_outline = _distances_on_screen(film.at(index), contact, g_contact, gap) < np.maximum(
-            _SAME_POINT * resolution[index], _NEAR_OUTLINE
+    def _reach(self, sine: FloatArray) -> FloatArray:
+        """The distances (n,) within which points of a surface under these sines are the same."""
+        return _SAME_POINT * self.resolution * self.width / sine
+
+    def take_creases(self) -> None:
+        """Tell creases: both rays hit, at the same point."""
+        # The two sides of a crease are apart by what the flatter one is seen to recede.
+        other_sine = _sines(gradients_at(self.tracer, self.other), self.directions)
+        reach = self._reach(np.maximum(np.fmin(self.sine, other_sine), _FLATTEST))
+        with np.errstate(invalid="ignore"):
+            is_same = np.linalg.norm(self.x - self.other, axis=1) < reach
+        is_same &= self.jumps.before.is_hit & self.jumps.behind.is_hit
+        index = self.take(is_same, BoundaryKind.CREASE)
+        other = self.other[index]
+        self.conditions.set_second(index, other, gradients_at(self.tracer, other))
+
+    def take_ends(self) -> None:
+        """Tell ends: the point lies on a curve at which all level sets end."""
+        curve = _closest_on_curves(self.tracer, self.x)
+        if curve is None:
+            return
+        reach = self._reach(np.maximum(self.sine, _TOUCHING))
+        is_near = np.linalg.norm(self.x - curve, axis=1) < reach
+        index = self.take(is_near, BoundaryKind.END)
+        first, second = _beside_curve(self.x[index], curve[index], self.gradient[index])
+        self.conditions.set_first(index, first, gradients_at(self.tracer, first))
+        self.conditions.set_second(index, second, gradients_at(self.tracer, second))
+        self.x[index] = curve[index]
+
+    def take_cuts(self) -> None:
+        """Tell cuts: the point lies on the boundary of the domain or of a clip volume."""
+        cut = intersection_of([self.surface.field.domain, self.surface.clip_volume])
+        if cut is None:
+            return
+        depth = to_numpy(cut.signed_distance(upload_vectors(self.tracer.backend, self.x)))
+        reach = self._reach(np.maximum(self.sine, _TOUCHING))
+        if (index := self.take(np.abs(depth) < reach, BoundaryKind.CUT)).size:
+            x = self.x[index]
+            normal = cut.outward_normal(upload_vectors(self.tracer.backend, x))
+            self.conditions.set_second(index, x, to_numpy(normal).reshape(-1, 3))
+
+    def take_outlines(self) -> None:
+        """Tell outlines: beside the point there is a contact of the ray with the level, on the same
+        smooth side of the surface. Else the surface ends before, at an edge.
+
+        Between the point and the contact, the normal of a smooth side turns by the angle between
+        ray and surface, and not by much more.
+        """
+        index = self.left(self.sine < _BEND)
+        if not index.size:
+            return
+        sine, d = self.sine[index], self.directions[index]
+        contact = _contact(self.tracer, self.x[index], self.gradient[index], d, self.width[index])
+        g, gap = gradients_at(self.tracer, contact), _gaps(self.tracer, contact)
+        accuracy = np.maximum(_SAME_POINT * self.resolution[index], _NEAR_OUTLINE)
+        is_contact = _distances_on_screen(self.film.at(index), contact, g, gap) < accuracy
+        is_contact &= (_sines(g, d) < _TOUCHING / 2) | (sine < _TOUCHING)
+        is_contact &= _cosines(self.gradient[index], g) > np.sqrt(1 - sine**2) - _MORE_TURN
+        index, contact = index[is_contact], contact[is_contact]
+        self.kind[index] = int(BoundaryKind.OUTLINE)
+        self.conditions.set_first(index, contact, g[is_contact])
+        self.x[index] = contact
+
+    def take_edges(self) -> None:
+        """Tell edges: a ray a little farther inside soon leaves the solid again."""
+        index = self.left()
+        if not index.size:
+            return
+        first, second, is_edge = _sides_of_edges(
+            self.jumps, self.film, self.surface, index, self.is_front[index]
         )
-        is_outline &= _cosines(g[index], g_contact) > _SAME_SIDE
-        index, contact = index[is_outline], contact[is_outline]
-        kind[index] = int(BoundaryKind.OUTLINE)
-        conditions.set_first(index, contact, g_contact[is_outline])
-        x[index] = contact
-    # Outlines that bend within a few pixels: rays beside them do not yet nearly touch the surface.
-    if (left := np.flatnonzero((kind == int(BoundaryKind.UNKNOWN)) & (sine < _BEND))).size:
-        contact = _contact(tracer, x[left], g[left], directions[left], width[left])
-        gradient = gradients_at(tracer, contact)
-        away = _gaps(tracer, contact) / np.linalg.norm(gradient, axis=1)
-        is_contact = _sines(gradient, directions[left]) < _TOUCHING / 2
-        is_contact &= away < _SAME_POINT * (resolution * width)[left]
-        index, contact = left[is_contact], contact[is_contact]
-        kind[index] = int(BoundaryKind.OUTLINE)
-        conditions.set_first(index, contact, gradient[is_contact])
-        x[index] = contact
-    left = np.flatnonzero(kind == int(BoundaryKind.UNKNOWN))
-    if left.size:
-        first, second, is_edge = _sides_of_edges(jumps, film, surface, left, is_front[left])
-        g_second = gradients_at(tracer, second)
-        length = np.linalg.norm(second - first, axis=1) / width[left]
-        is_along = _sines(g_second, directions[left]) < _TOUCHING
+        g = gradients_at(self.tracer, second)
+        length = np.linalg.norm(second - first, axis=1) / self.width[index]
+        is_along = _sines(g, self.directions[index]) < _TOUCHING
         is_edge &= (length < _LONGEST_EDGE) | is_along
-        index, first, second = left[is_edge], first[is_edge], second[is_edge]
-        kind[index] = int(BoundaryKind.EDGE)
-        conditions.set_first(index, first, gradients_at(tracer, first))
-        conditions.set_second(index, second, g_second[is_edge])
-    take(sine < _TOUCHING, BoundaryKind.OUTLINE)  # at corners, where edges end in outlines
-    return solve_conditions(jumps, film, kind, x, conditions)
+        index, first, second = index[is_edge], first[is_edge], second[is_edge]
+        self.kind[index] = int(BoundaryKind.EDGE)
+        self.conditions.set_first(index, first, gradients_at(self.tracer, first))
+        self.conditions.set_second(index, second, g[is_edge])
 
 
 @dataclass(frozen=True)
