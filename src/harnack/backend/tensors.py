@@ -139,6 +139,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         ImportError: PyTorch is not installed.
     """
     torch: Any = importlib.import_module("torch")
+    first_derivative = _refusing_second_derivatives(torch)
 
     def run_function(arguments: list[Any], tensors: tuple[Any, ...]) -> tuple[list[Any], Any]:
         """Call `function`. Returns its tensor arguments as Dr.Jit tensors with derivatives, and its
@@ -151,21 +152,6 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         remaining = iter(inputs)
         all_arguments = (next(remaining) if value is None else value for value in arguments)
         return inputs, function(*all_arguments)
-
-    class FirstDerivative(torch.autograd.Function):
-        """The identity for a gradient that is asked for with create_graph=True. It depends on the
-        arguments, and its own derivative is refused: PyTorch would take it for 0."""
-
-        @staticmethod
-        def forward(ctx: Any, gradient: Any, *sources: Any) -> Any:
-            """Return the gradient. sources: all that it depends on."""
-            del ctx, sources
-            return gradient.clone()
-
-        @staticmethod
-        def backward(ctx: Any, *cotangents: Any) -> Any:
-            """Raise NotImplementedError."""
-            raise NotImplementedError(_NO_SECOND_DERIVATIVE)
 
     class Wrapped(torch.autograd.Function):
         """The function in the form that PyTorch's automatic differentiation calls. `ctx` is
@@ -214,7 +200,7 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
                     *ctx.saved_tensors,
                     *(value for value in cotangents if value is not None),
                 ]
-                gradients = [FirstDerivative.apply(part, *sources) for part in gradients]
+                gradients = [first_derivative(part, *sources) for part in gradients]
             remaining = iter(gradients)
             own = (next(remaining) if dr.is_float_v(value) else None for value in inputs)
             return None, None, *own
@@ -229,6 +215,28 @@ def wrap_for_torch(function: Callable[..., Any]) -> Callable[..., Any]:
         return _in_container(own_result, iter(Wrapped.apply(arguments, own_result, *tensors)))
 
     return wrapped
+
+
+def _refusing_second_derivatives(torch: Any) -> Callable[..., Any]:
+    """Return the identity for a gradient that is asked for with create_graph=True, as a function of
+    PyTorch, the module `torch`. It depends on the arguments, and its own derivative is refused:
+    PyTorch would take it for 0."""
+
+    class FirstDerivative(torch.autograd.Function):
+        """That function."""
+
+        @staticmethod
+        def forward(ctx: Any, gradient: Any, *sources: Any) -> Any:
+            """Return the gradient. sources: all that it depends on."""
+            del ctx, sources
+            return gradient.clone()
+
+        @staticmethod
+        def backward(ctx: Any, *cotangents: Any) -> Any:
+            """Raise NotImplementedError."""
+            raise NotImplementedError(_NO_SECOND_DERIVATIVE)
+
+    return cast("Any", FirstDerivative).apply
 
 
 def _results(outputs: Any) -> list[Any]:
