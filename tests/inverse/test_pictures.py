@@ -14,6 +14,7 @@ from drjit.llvm.ad import Array3f, Array3f64, Float, Float64, TensorXf, TensorXf
 
 import harnack as hk
 from harnack.backend import choose_backend
+from harnack.backend.arrays import upload_floats
 from harnack.inverse.boundary_motion import BoundaryKind, boundary_motion
 from harnack.inverse.film import Film
 from tests.backend.test_kernels import compiled
@@ -216,15 +217,21 @@ def moved_solid(k: int) -> tuple[list[Any], Any]:
     return [radius], hk.Sphere(radius) | hk.Cuboid((0.5, 0.5, 0.9))
 
 
+def aligned(numbers: np.ndarray) -> TensorXf64:
+    """A tensor in memory of Dr.Jit: of a NumPy array it takes the memory, and compiles other
+    kernels where this begins at other addresses."""
+    return TensorXf64(upload_floats(choose_backend("double"), numbers.ravel()), numbers.shape)
+
+
 def moved_curve(k: int) -> tuple[list[Any], Any]:
-    vertices = TensorXf64(LOOP * (1 + 0.02 * k))
+    vertices = aligned(LOOP * (1 + 0.02 * k))
     dr.enable_grad(vertices)
     return [vertices], hk.SolidAngle(vertices)
 
 
 def moved_points(k: int) -> tuple[list[Any], Any]:
     points = hk.geometry.example_meshes.icosphere(1)[0]
-    numbers = [TensorXf64(a) for a in (0.6 * points * (1 + 0.02 * k), points, np.full(42, 0.1))]
+    numbers = [aligned(a) for a in (0.6 * points * (1 + 0.02 * k), points, np.full(42, 0.1))]
     dr.enable_grad(numbers)
     return numbers, hk.DipolePotential(*numbers, smoothing=0.2)
 

@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harnack.backend.arrays import to_numpy, upload_vectors
+from harnack.inverse.film import at_least_two
 from harnack.tracer.ray_crossings import crossings_to_numpy, trace_crossings
 from harnack.tracer.rays import RayBatch
 from harnack.tracer.surface import intersection_of
@@ -404,14 +405,14 @@ def gradients_at(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
     """grad f at points (n, 3)."""
     if not len(points):
         return np.zeros((0, 3))
-    sample = tracer.sample(upload_vectors(tracer.backend, points))
-    return to_numpy(sample.gradient).reshape(-1, 3)
+    sample = tracer.sample(upload_vectors(tracer.backend, at_least_two(points)))
+    return to_numpy(sample.gradient).reshape(-1, 3)[: len(points)]
 
 
 def _gaps(tracer: SurfaceTracer, points: FloatArray) -> FloatArray:
     """|f - level| at points (n, 3), with the nearest level."""
-    value = tracer.sample(upload_vectors(tracer.backend, points)).value
-    return np.abs(to_numpy(tracer.levels.offset_to_nearest(value)))
+    value = tracer.sample(upload_vectors(tracer.backend, at_least_two(points))).value
+    return np.abs(to_numpy(tracer.levels.offset_to_nearest(value)))[: len(points)]
 
 
 def _distances_on_screen(film: Screen, x: FloatArray, g: FloatArray, gap: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ from harnack.inverse.discontinuities import (
     jump_weights,
     piece_weights,
 )
-from harnack.inverse.film import has_fixed_pose, pixel_indices
+from harnack.inverse.film import at_least_two, has_fixed_pose, pixel_indices
 from harnack.inverse.outlines import with_exact_outlines
 from harnack.inverse.scanline_samples import scanline_samples
 from harnack.inverse.shadow_motion import with_shadow_motion
@@ -263,9 +263,10 @@ class Drawing:
                 np.zeros(0, bool), np.zeros((0, channel_count)), np.zeros(0), np.zeros((0, 3))
             )
         with dr.suspend_grad():
-            rays = self._rays(points, self._fine_tracer.backend)
+            rays = self._rays(at_least_two(points), self._fine_tracer.backend)
             hits, _ = hits_with_derivatives(self._fine_tracer, rays)
-            return self._seen(self._on_level(hits, rays), rays)
+            seen = self._seen(self._on_level(hits, rays), rays)
+            return seen.at(np.arange(len(points)))
 
     def _on_level(self, hits: Hits, rays: RayBatch) -> Hits:
         """The hits of rays, moved from within the tolerance onto the level: near the curves at

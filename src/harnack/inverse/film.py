@@ -127,6 +127,12 @@ class Film:
         return 2 * depth * np.linalg.norm(self.right) / self.size[0]
 
 
+def at_least_two(points: FloatArray) -> FloatArray:
+    """The points (n, k), or a single one twice: kernels for a single lane are others, and would be
+    compiled at the first step of an optimization at which only one point is of some kind."""
+    return np.repeat(points, 2, axis=0) if len(points) == 1 else points
+
+
 def pixel_indices(screen: FloatArray, size: tuple[int, int]) -> IntArray:
     """The indices (n,) of the pixels in which screen points (n, 2) lie, counted by rows."""
     column, row = (np.minimum(screen[:, k].astype(int), size[k] - 1) for k in (0, 1))
